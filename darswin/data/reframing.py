@@ -20,7 +20,6 @@ from darswin.data.scenes.targets import nothing_of
 from darswin.data.warping import Part, area_resized, picture_size, remap, size_of_part, taken_part
 from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
-from darswin.lens.pixels import OUTSIDE
 from darswin.lens.solve import direction_of
 from darswin.utils.tasks import Fit
 
@@ -31,6 +30,7 @@ _APART = 1.5
 _RADII = 4096  # entries of a table
 _AZIMUTHS = 1024
 _NUDGE = 1e-3  # px, more than the rounding of places in float32
+_OUTSIDE = -1e6  # px, beyond any picture
 _ROUNDING = 1 + 1e-6  # of radii at θ_max
 _MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
 
@@ -83,13 +83,14 @@ class Reframing:
 
     Args:
         lens: the lens of the new picture, with its image_size.
+        turn: about the optical axis.
         scale: the pixels of the old picture along a pixel of the new one.
         render: (H, W), the number of points along the sides at which an image is read, if it is not
             only resized. None means up to 5 points along each new pixel.
     """
 
-    def __init__(self, lens: Lens, scale: float, render: tuple[int, int] | None):
-        self.lens, self.size, self._scale = lens, picture_size(lens), scale
+    def __init__(self, lens: Lens, turn: Turn, scale: float, render: tuple[int, int] | None):
+        self.lens, self.size, self._turn = lens, picture_size(lens), turn
         # An odd number, so that one of the points is the centre of the pixel.
         most = 2 * math.ceil((scale / _APART - 1) / 2) + 1
         points = min(_MOST_POINTS, most) if scale > 1 else 1
@@ -109,8 +110,9 @@ class Reframing:
 
     def target(self, target: np.ndarray) -> np.ndarray:
         """The new values (H', W') of the pixels of a target (H, W); unknown beyond θ_max."""
-        centres = (np.arange(k) + _aside(k) / self._scale for k in self.size)
-        x, y = np.moveaxis(np.rint(self._places(*centres)), -1, 0)
+        aside = np.stack(np.meshgrid(*map(_aside, self.size[::-1])), -1) @ self._turn.matrix
+        places = np.rint(self._places(*map(np.arange, self.size)) + aside)
+        x, y = np.moveaxis(places, -1, 0)
         height, width = target.shape
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)  # NaN is not
         found = np.full(self.size, nothing_of(target), target.dtype)
@@ -172,8 +174,8 @@ class Moved(Reframing):
         turned, moves = _turned(lens, turn)
         top, left, height, width = part
         scale = max(height / size[0], width / size[1])
-        super().__init__(turned.cropped(*part).resized(size), scale, render)
-        self._turn, self._part = turn, part
+        super().__init__(turned.cropped(*part).resized(size), turn, scale, render)
+        self._part = part
         # Of pixels (x, y, 1), as (2, 3) matrices: into the part, and into the new picture.
         self._moves = moves - [[0, 0, left], [0, 0, top]]
         self._matrix = _resized(self._moves, (width, height), size[::-1])
@@ -220,7 +222,7 @@ def _resized(matrix: np.ndarray, before: tuple[int, int], after: tuple[int, int]
 
 def _unseen(lens: Lens) -> np.ndarray:
     """True for pixels (H, W) beyond θ_max."""
-    u, v = _flat(lens, *map(np.arange, picture_size(lens)))
+    u, v = _flat(lens, *map(np.arange, picture_size(lens)), STILL.matrix)
     radius = np.sqrt(u * u + v * v)
     if lens.is_radial:
         return radius > _ROUNDING * lens.r_max.item()
@@ -252,25 +254,25 @@ class Warped(Reframing):
     def __init__(
         self, own: Lens, lens: Lens, turn: Turn = STILL, render: tuple[int, int] | None = None
     ):
-        self._own, self._turn = own, turn.matrix
-        super().__init__(lens, (own.r_max / lens.r_max).item(), render)
+        super().__init__(lens, turn, (own.r_max / lens.r_max).item(), render)
+        self._own = own
 
     def to_new(self, points: np.ndarray) -> np.ndarray:
-        return _seen_by(self.lens, self._own, points, self._turn)
+        return _seen_by(self.lens, self._own, points, self._turn.matrix)
 
     def to_old(self, points: np.ndarray) -> np.ndarray:
-        return _seen_by(self._own, self.lens, points, self._turn.T)
+        return _seen_by(self._own, self.lens, points, self._turn.matrix.T)
 
     def image(self, image: np.ndarray) -> np.ndarray:
         places = self._places(*map(_centres, self.size, self._render))
-        places = np.fmax(places, OUTSIDE, dtype=np.float32)  # NaN becomes OUTSIDE
         return area_resized(remap(image, places), self.size)
 
     def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         if not self.lens.is_radial:
-            return super()._places(y, x)
+            places = super()._places(y, x)
+            return np.where(np.isnan(places), _OUTSIDE, places).astype(np.float32)
         last, ratios, angles = self._curves
-        u, v = _flat(self.lens, y, x, self._turn.T)
+        u, v = _flat(self.lens, y, x, self._turn.matrix.T)
         radius = np.sqrt(u * u + v * v)
         share = radius * ((_RADII - 1) / last)
         whole = np.floor(share)
@@ -280,16 +282,21 @@ class Warped(Reframing):
         def at(table: np.ndarray) -> np.ndarray:
             return table[0].take(index, mode="clip") + table[1].take(index, mode="clip") * share
 
-        places, ratio = np.empty((*radius.shape, 2), np.float32), at(ratios)
-        offset = np.zeros(2, np.float32)
+        ratio = at(ratios)
         if angles is not None:
             ray = np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None]
             rays = torch.from_numpy(at(angles))[None], torch.from_numpy(ray)[None]
             offset = self._own.offset(*rays)[0].numpy()
-        u, v = u * ratio + offset[..., 0], v * ratio + offset[..., 1]
-        center, affine = _frame(self._own)
-        for k, (a, b) in enumerate(affine.tolist()):
-            np.add(a * u + b * v, center[k], out=places[..., k])
+        u *= ratio
+        v *= ratio
+        if angles is not None:
+            u, v = u + offset[..., 0], v + offset[..., 1]
+        if self._own.affine is not None:
+            u, v = (a * u + b * v for a, b in self._own.affine[0].tolist())
+        places = np.empty((*radius.shape, 2), np.float32)
+        cx, cy = self._own.center_in()[0].tolist()
+        np.add(u, cx, out=places[..., 0])
+        np.add(v, cy, out=places[..., 1])
         return places
 
     @cached_property
@@ -298,7 +305,7 @@ class Warped(Reframing):
         radii up to it, the radius in the old picture as a multiple, and θ if the old lens is not
         radial: values and the steps between them, (2, K).
 
-        They are computed once, because an image has many more radii. The last value is NaN.
+        They are computed once, because an image has many more radii. Radii beyond lead outside.
         """
         last = torch.minimum(self._own.theta_max, self.lens.theta_max)
         theta = torch.linspace(0, 1, _RADII)[None] * last
@@ -307,8 +314,10 @@ class Warped(Reframing):
         ratios = np.interp(radii, new, old)
         ratios[1:] /= radii[1:]
         ratios[0] = old[1] / new[1]
-        angles = None if self._own.is_radial else np.interp(radii, new, theta[0].numpy())
-        return new[-1].item(), _table(ratios), None if angles is None else _table(angles)
+        tables = [ratios] if self._own.is_radial else [ratios, np.interp(radii, new, theta[0])]
+        ratio, *angle = (np.stack((k, np.diff(k, append=k[-1]))).astype(np.float32) for k in tables)
+        ratio[0, -1] = -_OUTSIDE
+        return new[-1].item(), ratio, angle[0] if angle else None
 
 
 def _seen_by(lens: Lens, own: Lens, points: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -317,13 +326,6 @@ def _seen_by(lens: Lens, own: Lens, points: np.ndarray, turn: np.ndarray) -> np.
     theta, direction = own.rays(torch.from_numpy(np.asarray(points, np.float64))[None])
     theta = torch.where(own.sees(theta), theta, torch.nan)
     return lens.seen_pixels(theta, direction @ torch.from_numpy(turn.T))[0].numpy()
-
-
-def _table(values: np.ndarray) -> np.ndarray:
-    table = np.full((2, len(values)), np.nan, np.float32)
-    table[0, :-1] = values[:-1]
-    np.subtract(values[1:], values[:-1], out=table[1, :-1], casting="same_kind")
-    return table
 
 
 # -- points in pixels -------------------------------------------------------------------------
@@ -335,7 +337,7 @@ def _centres(size: int, count: int) -> np.ndarray:
 
 
 def _aside(size: int) -> np.ndarray:
-    """The offset of each centre, px, before the nearest pixel is chosen, (size,).
+    """The offset of each place, px, before the nearest pixel is chosen, (size,).
 
     An even reduction puts every centre halfway between two pixels. If all took the upper one, the
     whole target would be shifted. So neighbours move in opposite directions. Pixels at mirrored
@@ -345,16 +347,11 @@ def _aside(size: int) -> np.ndarray:
     return _NUDGE * np.concatenate((-sign, np.zeros(size % 2), sign[::-1]))
 
 
-def _flat(lens: Lens, y: np.ndarray, x: np.ndarray, turn: np.ndarray | None = None) -> list:
+def _flat(lens: Lens, y: np.ndarray, x: np.ndarray, turn: np.ndarray) -> list:
     """The points (u, v) around the principal point, before `affine` and after a turn, of the pixels
     at y (H,) and x (W,): two arrays (H, W) float32."""
-    (cx, cy), affine = _frame(lens)
+    cx, cy = lens.center_in()[0].tolist()
     x, y = (x - cx).astype(np.float32), (y - cy).astype(np.float32)[:, None]
-    back = np.linalg.inv(affine)
-    return [a * x + b * y for a, b in (back if turn is None else turn @ back).tolist()]
-
-
-def _frame(lens: Lens) -> tuple[list[float], np.ndarray]:
-    """The principal point and `affine` of a lens."""
-    affine = np.eye(2) if lens.affine is None else lens.affine[0].numpy()
-    return lens.center_in()[0].tolist(), affine
+    if lens.affine is not None:
+        turn = turn @ np.linalg.inv(lens.affine[0].double().numpy())
+    return [a * x + b * y for a, b in turn.tolist()]
