@@ -7,6 +7,7 @@ side alternates from pixel to pixel, so that the target is not shifted relative 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -17,7 +18,7 @@ import torch
 
 from darswin.data.sample import Sample
 from darswin.data.scenes.targets import nothing_of
-from darswin.data.warping import Part, area_resized, picture_size, remap, size_of_part, taken_part
+from darswin.data.warping import Part, area_resized, picture_size, size_of_part, taken_part
 from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.solve import direction_of
@@ -106,22 +107,29 @@ class Reframing:
 
     def image(self, image: np.ndarray) -> np.ndarray:
         """The new image, (H', W', C), of (H, W, C)."""
-        raise NotImplementedError
+        grid = (
+            _centres(*sides).astype(np.float32)
+            for sides in zip(self.size, self._render, strict=True)
+        )
+        x, y = self._places(*grid)
+        return area_resized(cv2.remap(image, x, y, cv2.INTER_LINEAR), self.size)
 
     def target(self, target: np.ndarray) -> np.ndarray:
         """The new values (H', W') of the pixels of a target (H, W); unknown beyond θ_max."""
-        aside = np.stack(np.meshgrid(*map(_aside, self.size[::-1])), -1) @ self._turn.matrix
-        places = np.rint(self._places(*map(np.arange, self.size)) + aside)
-        x, y = np.moveaxis(places, -1, 0)
+        x, y = self._places(*map(np.arange, self.size))
+        down, across = map(_aside, self.size)
+        (a, b), (c, d) = self._turn.matrix.T.tolist()
+        x = np.rint(x + a * across + b * down[:, None])
+        y = np.rint(y + c * across + d * down[:, None])
         height, width = target.shape
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)  # NaN is not
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         found = np.full(self.size, nothing_of(target), target.dtype)
         found[inside] = target[y[inside].astype(np.intp), x[inside].astype(np.intp)]
         return found
 
-    def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """`to_old` of the pixels at y (H,) and x (W,), (H, W, 2)."""
-        return self.to_old(np.stack(np.meshgrid(x, y), -1))
+    def _places(self, y: np.ndarray, x: np.ndarray) -> Sequence[np.ndarray]:
+        """`to_old` of the pixels at y (H,) and x (W,): x and y, (H, W), far outside for NaN."""
+        raise NotImplementedError
 
 
 def reframe(sample: Sample, reframing: Reframing) -> Sample:
@@ -176,9 +184,10 @@ class Moved(Reframing):
         scale = max(height / size[0], width / size[1])
         super().__init__(turned.cropped(*part).resized(size), turn, scale, render)
         self._part = part
-        # Of pixels (x, y, 1), as (2, 3) matrices: into the part, and into the new picture.
-        self._moves = moves - [[0, 0, left], [0, 0, top]]
-        self._matrix = _resized(self._moves, (width, height), size[::-1])
+        # Pixels (x, y, 1) of the old picture become those of the new one.
+        zoom = np.array([[size[1] / width], [size[0] / height]])
+        self._matrix = zoom * (moves - [[0, 0, left], [0, 0, top]])
+        self._matrix[:, 2:] += (zoom - 1) / 2
 
     def to_new(self, points: np.ndarray) -> np.ndarray:
         return points @ self._matrix[:, :2].T + self._matrix[:, 2]
@@ -187,14 +196,17 @@ class Moved(Reframing):
         return (points - self._matrix[:, 2]) @ np.linalg.inv(self._matrix[:, :2]).T
 
     def image(self, image: np.ndarray) -> np.ndarray:
-        top, left, height, width = self._part
         if self._turn.angle:
-            matrix = _resized(self._moves, (width, height), self._render[::-1])
-            return area_resized(cv2.warpAffine(image, matrix, self._render[::-1]), self.size)
+            return super().image(image)
+        top, left, height, width = self._part
         if self._turn.mirrored:
             left = image.shape[1] - left - width
         image = area_resized(image[top : top + height, left : left + width], self.size)
         return np.ascontiguousarray(image[:, ::-1]) if self._turn.mirrored else image
+
+    def _places(self, y: np.ndarray, x: np.ndarray) -> Sequence[np.ndarray]:
+        back = cv2.invertAffineTransform(self._matrix).tolist()
+        return [a * x + (b * y + c)[:, None] for a, b, c in back]
 
     def target(self, target: np.ndarray) -> np.ndarray:
         found = super().target(target)
@@ -212,12 +224,6 @@ def _turned(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
         moves = moves * [[-1.0], [1.0]] + [[0, 0, picture_size(lens)[1] - 1], [0, 0, 0]]
         lens = upright(lens, _MIRRORED)
     return lens, moves
-
-
-def _resized(matrix: np.ndarray, before: tuple[int, int], after: tuple[int, int]) -> np.ndarray:
-    """A matrix (2, 3) into a picture of (W, H), for that picture at another size."""
-    scale = np.divide(after, before)[:, None]
-    return matrix * scale + np.concatenate((np.zeros((2, 2)), (scale - 1) / 2), 1)
 
 
 def _unseen(lens: Lens) -> np.ndarray:
@@ -263,14 +269,10 @@ class Warped(Reframing):
     def to_old(self, points: np.ndarray) -> np.ndarray:
         return _seen_by(self._own, self.lens, points, self._turn.matrix.T)
 
-    def image(self, image: np.ndarray) -> np.ndarray:
-        places = self._places(*map(_centres, self.size, self._render))
-        return area_resized(remap(image, places), self.size)
-
-    def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def _places(self, y: np.ndarray, x: np.ndarray) -> Sequence[np.ndarray]:
         if not self.lens.is_radial:
-            places = super()._places(y, x)
-            return np.where(np.isnan(places), _OUTSIDE, places).astype(np.float32)
+            places = self.to_old(np.stack(np.meshgrid(x, y), -1))
+            return np.moveaxis(np.nan_to_num(places, nan=_OUTSIDE).astype(np.float32), -1, 0).copy()
         last, ratios, angles = self._curves
         u, v = _flat(self.lens, y, x, self._turn.matrix.T)
         radius = np.sqrt(u * u + v * v)
@@ -293,11 +295,10 @@ class Warped(Reframing):
             u, v = u + offset[..., 0], v + offset[..., 1]
         if self._own.affine is not None:
             u, v = (a * u + b * v for a, b in self._own.affine[0].tolist())
-        places = np.empty((*radius.shape, 2), np.float32)
         cx, cy = self._own.center_in()[0].tolist()
-        np.add(u, cx, out=places[..., 0])
-        np.add(v, cy, out=places[..., 1])
-        return places
+        u += cx
+        v += cy
+        return u, v
 
     @cached_property
     def _curves(self) -> tuple[float, np.ndarray, np.ndarray | None]:
