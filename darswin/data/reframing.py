@@ -228,7 +228,8 @@ def _turned(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
 
 def _unseen(lens: Lens) -> np.ndarray:
     """True for pixels (H, W) beyond θ_max."""
-    u, v = _flat(lens, *map(np.arange, picture_size(lens)), STILL.matrix)
+    height, width = picture_size(lens)
+    u, v = _flat(lens, np.arange(height), np.arange(width), STILL.matrix)
     radius = np.sqrt(u * u + v * v)
     if lens.is_radial:
         return radius > _ROUNDING * lens.r_max.item()

@@ -96,7 +96,7 @@ class Samples(Dataset):
                 return lost
         return None
 
-    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor]:
+    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor | None]:
         if not isinstance(draw, Draw):
             draw = Draw(0, int(draw), int(draw))
         try:
@@ -115,10 +115,8 @@ class Samples(Dataset):
         image = (image - self.mean) / self.std
         if self.erase:
             image = self.erase(image, rng)
-        if isinstance(target, np.ndarray):
-            target = torch.from_numpy(target)
-            target = target if target.is_floating_point() else target.long()
-        return torch.from_numpy(np.ascontiguousarray(image)), lens, target
+        label = as_tensor(target) if isinstance(target, np.ndarray) else target
+        return torch.from_numpy(np.ascontiguousarray(image)), lens, label
 
     def headers(self, index: int) -> Sequence[Header]:
         """The headers of a picture's files; none for pictures in memory."""
@@ -199,6 +197,12 @@ class Samples(Dataset):
     def _unknown(self) -> int | Tensor:
         """The label of a picture that cannot be read."""
         return -1
+
+
+def as_tensor(target: np.ndarray) -> Tensor:
+    """A target of pixels as a tensor: ids of labels as int64."""
+    tensor = torch.from_numpy(target)
+    return tensor if tensor.is_floating_point() else tensor.long()
 
 
 class Calibrated(Samples):

@@ -190,9 +190,13 @@ class FullSize:
         Returns:
             (H, W) float32, m; 0 without an answer.
         """
-        logarithm = np.log(np.where(self.reached, distance, 1))
+        metres = np.exp(self.values(np.log(np.where(self.reached, distance, 1))))
+        return np.where(self.seen, metres, np.float32(0))
+
+    def values(self, values: np.ndarray) -> np.ndarray:
+        """Any values (h, w), interpolated linearly: (H, W) float32, 0 without an answer."""
         weight = np.where(self._weight > 0, self._weight, 1)
-        return self._in_picture(np.exp(self._weighted(logarithm) / weight), 0.0)
+        return self._in_picture(self._weighted(values) / weight, 0)
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
         """Values (h, w) at the pixels that `at_size` kept, times the share that a ray reaches."""

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from darswin.data.sample import Sample
-from darswin.data.samples import Draw, Samples
+from darswin.data.samples import Draw, Samples, as_tensor
 from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import IGNORE
+from darswin.data.scenes.targets import nothing
 from darswin.data.warping import Crop
 from darswin.lens import Lens
 from darswin.utils.image import Header
@@ -64,7 +63,4 @@ class SceneSamples(Samples):
         return self.scenes.lens_alone(draw.picture)
 
     def _unknown(self) -> Tensor:
-        shape = self.size, self.size
-        if self.scenes.target == "labels":
-            return torch.full(shape, IGNORE, dtype=torch.int64)
-        return torch.zeros(shape)
+        return as_tensor(nothing(self.scenes.target, (self.size, self.size)))

@@ -14,10 +14,9 @@ from darswin.data.pictures import Form, form_of
 from darswin.data.sample import Sample
 from darswin.data.scenes.targets import (
     IGNORE,
+    KINDS,
     Target,
     nothing_of,
-    read_distance,
-    read_labels,
     target_header,
 )
 from darswin.data.splits import Limited, read_classes, some
@@ -44,7 +43,7 @@ class Scenes(Limited):
         lenses: the lenses of the pictures. target: "labels" or "distance", the kind of the targets.
         classes: the names and colours of the ids in labels.
         views: the name of each picture's camera in `cameras`; None takes the names from `lenses`.
-        read: the function that reads a target file; None means `read_labels` or `read_distance`.
+        read: the function that reads a target file; None means the one of `target`.
         trim: (rows, height): the number of rows that are cut at the top and at the bottom of a
             picture of this height, and the same share of other pictures. The lenses follow.
 
@@ -72,8 +71,8 @@ class Scenes(Limited):
         self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, 3
         self.classes, self.colors = list(classes.names), list(classes.colors)
         if read is None:
-            labels = target == "labels"
-            read = partial(read_labels, classes=len(classes.names)) if labels else read_distance
+            read = KINDS[target].read
+            read = partial(read, classes=len(classes.names)) if target == "labels" else read
         self.read, self.trim = read, trim
         # Worker processes share arrays, but would copy a million strings.
         self._pictures = np.array([os.fsencode(picture) for picture, _ in files], np.bytes_)
