@@ -100,7 +100,7 @@ class Samples(Dataset):
         if not isinstance(draw, Draw):
             draw = Draw(0, int(draw), int(draw))
         try:
-            image, target, lens = self._shown(draw)
+            image, target, lens = self.shown(draw)
         except BrokenImageError:
             if not self.skip_broken:
                 raise
@@ -127,7 +127,7 @@ class Samples(Dataset):
         """Raises what `self[index]` would raise, as far as its headers tell; for None, the files
         are read. `skip_broken` has no effect."""
         if headers is None:
-            self._shown(Draw(0, index, index))
+            self.shown(Draw(0, index, index))
         elif headers:
             self._check(index, headers)
 
@@ -137,8 +137,8 @@ class Samples(Dataset):
     def _random(self, epoch: int, key: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, epoch, key, purpose))
 
-    def _shown(self, draw: Draw) -> Sample:
-        """The sample at the size, before augmentation of its colours."""
+    def shown(self, draw: Draw) -> Sample:
+        """The sample at the size, before its colours are changed; `image` is (size, size, C) uint8."""
         sample = self._read(draw)
         return reframe(sample, self._reframing(sample.lens, draw))
 
