@@ -138,7 +138,7 @@ class Samples(Dataset):
         return np.random.default_rng((self.seed, epoch, key, purpose))
 
     def shown(self, draw: Draw) -> Sample:
-        """The sample at the size, before its colours are changed; `image` is (size, size, C) uint8."""
+        """The sample at the size, before its colours are changed, with an image (H, W, C) uint8."""
         sample = self._read(draw)
         return reframe(sample, self._reframing(sample.lens, draw))
 
