@@ -223,6 +223,7 @@ def sampling_call(
 ) -> Case:  # fmt: skip
     """A call of polar_sample."""
     options = dict(samples=samples, jitter=jitter, seed=seed, layout=layout)
+    channels = inputs["image"].shape[1]
     settings = options | dict(azimuths=azimuths)
 
     def run(image, radii, center, **general):
@@ -236,7 +237,7 @@ def sampling_call(
         smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
         if jitter > 0:
             smooth &= r > 1e-3
-        planes = smooth[:, None].expand(-1, image.shape[1], -1, -1).to(f64)
+        planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
         return planes if layout == "image" else to_tokens(planes, samples)
 
     return Case(run, inputs, mask, settings)
