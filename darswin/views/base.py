@@ -250,7 +250,7 @@ class PixelView(View):
 
     def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
         seen = check_seen_images(seen, self.size or prepared.size, channels)
-        if prepared.points is not None:
+        if isinstance(prepared.points, Tensor):
             check_count(prepared.points.shape[0], seen)
         return seen
 
