@@ -1,4 +1,4 @@
-"""polar_sample and polar_embed, compared with code that users write without them.
+"""polar_sample, compared with code that users write without it.
 
 `make bench`, or `python benchmarks/sampling.py [--quick] [--out FOLDER]`. Prints tables and
 the ratios with their targets. With a folder, it writes a record and a plot there.
@@ -19,7 +19,7 @@ from torch import Tensor
 from darswin import polar_grid
 from darswin.bench.timing import OURS, Case, Timing, measure
 from darswin.lens import Spherical
-from darswin.ops import polar_embed, polar_sample
+from darswin.ops import polar_sample
 
 
 def sampling_case(size: int, batch: int):
@@ -138,37 +138,6 @@ def large(case, images: Tensor, ours, tokens, remap, seconds: float) -> list[Tim
     )  # fmt: skip
 
 
-def embedding(size: int, batch: int, seconds: float) -> list[Timing]:
-    case = partial(Case, "polar_embed", f"{size}×{size}", batch, torch.get_num_threads())
-    images, grid, mesh, _ = sampling_case(size, batch)
-    arguments = (grid.radii, grid.azimuths, grid.center)
-    weight, bias = torch.randn(96, 300) / 300**0.5, torch.randn(96)
-
-    def ours(image, weight, bias):
-        return polar_embed(image, *arguments, weight, bias, samples=(10, 10))
-
-    def steps(image, weight, bias):
-        return F.linear(to_tokens(F.grid_sample(image, mesh, align_corners=True)), weight, bias)
-
-    name, inputs = "F.grid_sample + permute + F.linear", [images, weight, bias]
-    tokens = to_tokens(F.grid_sample(images, mesh, align_corners=True))
-    runs = {OURS: ours, name: steps}
-    alone = {"F.linear alone": lambda _, w, b: F.linear(tokens, w, b)}
-    timings = compare(
-        case("forward"), runs | alone, inputs, seconds,
-        targets={name: 5.0, "F.linear alone": 1 / 1.4},
-    )  # fmt: skip
-    timings += compare(
-        case("forward+backward, all gradients"), runs, inputs, seconds,
-        targets={name: 4.0}, tolerance=1e-3,
-    )  # fmt: skip
-    of_weights = {peer: lambda w, b, run=run: run(images, w, b) for peer, run in runs.items()}
-    return timings + compare(
-        case("forward+backward, weight and bias"), of_weights, inputs[1:], seconds,
-        targets={name: 4.0}, tolerance=1e-3,
-    )  # fmt: skip
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one small case, short runs")
@@ -177,11 +146,7 @@ def main() -> None:
     torch.manual_seed(0)
     sizes = [(64, 8)] if args.quick else [(64, 8), (256, 8), (1024, 4)]
     seconds = 0.05 if args.quick else 0.3
-    jobs = []
-    for size, batch in sizes:
-        jobs.append(partial(sampling, size, batch, seconds))
-        if size <= 256:
-            jobs.append(partial(embedding, size, batch, seconds))
+    jobs = [partial(sampling, size, batch, seconds) for size, batch in sizes]
     run_suite("sampling", jobs, avx2_share=0.6, out=args.out)
 
 

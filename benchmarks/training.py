@@ -20,6 +20,7 @@ from tqdm import tqdm
 from darswin.bench.machine import machine, num_threads
 from darswin.bench.record import write
 from darswin.data.augment import RandAugment, RandomErasing
+from darswin.data.samples import Draw
 from darswin.ops import use_reference
 from darswin.train.classification import Classification
 from darswin.train.data import WideAngleData
@@ -85,12 +86,10 @@ def loader_rates(data: dict) -> dict[str, float]:
     module = WideAngleData(**data)
     dataset = module.dataset("train", augment=RandAugment(), erase=RandomErasing())
     rng = np.random.default_rng(0)
-    picture, _ = dataset.source[0]
-    _, lens, _ = dataset[0]
-    image = dataset.through(lens, picture)
+    image = dataset.shown(Draw(0, 0, 0)).image
     parts = {
         "read and decode": lambda k: dataset.source[k],
-        "warp and reduce": lambda k: dataset.through(lens, picture),
+        "read, warp and reduce": lambda k: dataset.shown(Draw(0, k, k)),
         "RandAugment": lambda k: RandAugment()(image, rng),
         "all": lambda k: dataset[k],
     }

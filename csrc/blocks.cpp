@@ -1,10 +1,13 @@
-// _norm, _linear and _blocks_ on CPU: the layers and the transformer blocks of optimized models.
+// _pack_linear, _norm, _linear and _blocks_ on CPU: the layers and the transformer blocks of
+// optimized models.
 //
 // For a small block, the Python calls take longer than its arithmetic. So all blocks of a stage are
 // one operator, which calls kernel after kernel.
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <cstring>
+#include <numeric>
 #include <vector>
 
 #include "add_norm.h"
@@ -20,6 +23,67 @@ void check_parameter(const Tensor& tensor, ScalarType type, int64_t count) {
   STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type && tensor.is_contiguous() &&
                       tensor.numel() == count,
                   kName, ": a parameter has a wrong type, layout or number of values");
+}
+
+// Packs a weight (D', D) for tokens of type X, in the layout of linear.h. `parameters` has
+// kParameters arrays of D' numbers of 32 bits; null stands for zeros. `spare` words follow the
+// panels.
+template <typename X>
+Tensor pack(const Tensor& weight, std::initializer_list<const void*> parameters, int64_t spare) {
+  constexpr bool is_float = std::is_same_v<X, float>;
+  using Weight = std::conditional_t<is_float, float, int8_t>;
+  constexpr int64_t kWord = sizeof(float);
+  const int64_t columns = weight.size(0), depth = weight.size(1);
+  const int64_t padded = padded_columns(columns), words = depth_words<X>(depth);
+  const int64_t count = layer_words<X>(depth, columns) + spare;
+  const Tensor packed = new_tensor(Sizes{count}, is_float ? ScalarType::Float : ScalarType::Int);
+  auto* to = mutable_pointer<char>(packed);
+  std::fill_n(to, count * kWord, 0);
+  for (const void* values : parameters) {
+    if (values != nullptr) std::memcpy(to, values, columns * kWord);
+    to += padded * kWord;
+  }
+  auto* panels = reinterpret_cast<Weight*>(to);
+  const Weight* from = pointer<Weight>(weight);
+  for (int64_t column = 0; column < columns; ++column) {
+    const int64_t first = column / kPanel * kPanel, width = std::min(kPanel, padded - first);
+    for (int64_t k = 0; k < depth; ++k) {
+      const int64_t word = first * words + k / kDepths<X> * width + column - first;
+      panels[word * kDepths<X> + k % kDepths<X>] = *from++;
+    }
+  }
+  return packed;
+}
+
+// With a `weight_scale`, the layer is quantized, and its tokens have this scale and zero point.
+Tensor pack_linear(Tensor weight, MaybeTensor bias, MaybeTensor weight_scale, double scale,
+                   int64_t zero_point) {
+  STD_TORCH_CHECK(weight.is_cpu() && weight.dim() == 2 &&
+                      weight.scalar_type() == (weight_scale ? ScalarType::Char : ScalarType::Float),
+                  "_pack_linear: weight must be (D', D) of float32 or, with a scale, of int8");
+  const int64_t columns = weight.size(0), depth = weight.size(1);
+  check_product({columns + kPanelUnit, depth + kParameters<uint8_t> + 1});
+  weight = as_contiguous(weight), bias = as_contiguous(bias);
+  weight_scale = as_contiguous(weight_scale);
+  for (const MaybeTensor& values : {bias, weight_scale}) {
+    if (values) check_parameter(*values, ScalarType::Float, columns);
+  }
+  const void* biases = bias ? bias->const_data_ptr() : nullptr;
+  if (!weight_scale) return pack<float>(weight, {biases}, 0);
+  const Quantizer tokens = quantizer(scale, zero_point);
+  std::vector<int32_t> offsets(columns);  // undo the zero point
+  for (int64_t column = 0; column < columns; ++column) {
+    const auto* row = pointer<int8_t>(weight) + column * depth;
+    const int64_t sum = std::accumulate(row, row + depth, int64_t{0});
+    offsets[column] = static_cast<int32_t>(-zero_point * sum);
+  }
+  const Tensor packed =
+      pack<uint8_t>(weight, {biases, weight_scale->const_data_ptr(), offsets.data()}, kLastWords);
+  auto* last = mutable_pointer<int32_t>(packed) + layer_words<uint8_t>(depth, columns);
+  last[0] = std::bit_cast<int32_t>(static_cast<float>(scale));
+  last[1] = std::bit_cast<int32_t>(tokens.steps);
+  last[2] = tokens.zero_point;
+  return packed;
 }
 
 // A packed linear layer. If its words are int32, it is quantized and reads tokens of 8 bits.
@@ -40,7 +104,7 @@ struct Layer {
                     ": this tier or this CPU has no products of 8 bits");
     STD_TORCH_CHECK(depth <= kMostDepth, kName, ": sums of so many products do not fit 32 bits");
     const int64_t count = layer_words<uint8_t>(depth, columns);
-    check_parameter(packed, ScalarType::Int, count + 3);
+    check_parameter(packed, ScalarType::Int, count + kLastWords);
     const auto* last = pointer<int32_t>(packed) + count;
     scale = std::bit_cast<float>(last[0]);
     quantizer = {std::bit_cast<float>(last[1]), last[2]};
@@ -226,6 +290,7 @@ void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> table
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
+  m.impl("_pack_linear", TORCH_BOX(&darswin::pack_linear));
   m.impl("_norm", TORCH_BOX(&darswin::norm));
   m.impl("_linear", TORCH_BOX(&darswin::linear));
   m.impl("_blocks_", TORCH_BOX(&darswin::blocks_));

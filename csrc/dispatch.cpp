@@ -2,6 +2,7 @@
 // never raise it above the CPU's best.
 #include "dispatch.h"
 
+#include <atomic>
 #include <cstdlib>
 #include <cstring>
 #include <optional>

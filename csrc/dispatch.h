@@ -1,7 +1,6 @@
 // Selects the tier of kernels that runs. Only drivers may include this, not kernels/ (see tier.h).
 #pragma once
 
-#include <atomic>
 #include <vector>
 
 #include "tier.h"
@@ -16,10 +15,6 @@ const char* tier_name(Tier tier);
 std::vector<Tier> available_tiers();  // this build's tiers that the CPU has, low to high
 bool set_tier(const char* name);      // false if the CPU or the build lacks that tier
 
-// The use of gathers to read far images: never, always where possible, or wherever they are faster
-// on this CPU.
-enum class Gathers { never, always, by_cpu };
-inline std::atomic<Gathers> gathers{Gathers::by_cpu};
 bool cpu_is_intel();
 bool cpu_has_vnni();  // of AVX-512
 

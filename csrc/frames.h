@@ -6,14 +6,6 @@
 
 namespace darswin {
 
-// The rule by which bilinear samples of 8-bit pixels are computed. Each but the first is the rule
-// of the operator for some images.
-//   raw: interpolate, and do not normalize
-//   far: interpolate, then normalize; at the border, normalize first
-//   near: normalize, then interpolate with weights
-//   near_rows: the same, but with differences where kTryDifferences (kernels/polar_bytes.h) says so
-enum class Blend { raw, far, near, near_rows };
-
 // The memory of the samples: (points, C) or (C, points) float32, or (points, C) uint8.
 enum class FrameOutput { tokens, planes, bytes };
 
@@ -21,7 +13,7 @@ struct ByteImage {
   const uint8_t* pixels;  // (H, W, C), with C = 1 or 3
   int64_t height, width, channels;
   int64_t row_stride, column_stride, channel_stride;  // no offset exceeds 31 bits
-  const float *scale, *offset;  // (C,): a pixel p has the value p * scale + offset
+  const float *scale, *offset;  // (C,): a sample v of the pixels becomes v * scale + offset
 };
 
 // A point whose four pixels are not all inside the frame.
@@ -40,7 +32,6 @@ struct FrameArgs {
   int64_t points;
   const BorderPoint* border;
   int64_t border_points;
-  Blend blend;
   FrameOutput output;
   void* out;
 };

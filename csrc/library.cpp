@@ -9,7 +9,7 @@
 #include "dispatch.h"
 #include "parallel.h"
 
-// The arguments that polar_sample and polar_embed share. Their order is that of the fields of
+// The arguments that polar_sample and its backward share. Their order is that of the fields of
 // struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
 #define SAMPLING                                                                                  \
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
@@ -25,10 +25,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_sample_backward(" SAMPLING
         ", bool tokens, Tensor grad_out, bool image_grad, bool lens_grad, bool offsets_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
-  m.def("polar_embed(" SAMPLING ", Tensor weight, Tensor? bias) -> Tensor");
-  m.def("polar_embed_backward(" SAMPLING
-        ", Tensor weight, Tensor grad_out, bool image_grad, bool lens_grad, bool offsets_grad, "
-        "bool weight_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, int[] periodic, "
       "float scale) -> Tensor");
@@ -47,6 +43,9 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
+  m.def(
+      "_pack_linear(Tensor weight, Tensor? bias, Tensor? weight_scale=None, float scale=1.0, "
+      "int zero_point=0) -> Tensor");
   m.def("_norm(Tensor x, Tensor parameters, float eps) -> Tensor");
   m.def(
       "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "
@@ -78,10 +77,6 @@ FACT const char* darswin_tiers() {
 
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
-
-// Reads far images without gathers (0), with them (1), or in the way that is faster on this CPU
-// (2).
-FACT void darswin_set_gathers(int way) { darswin::gathers = static_cast<darswin::Gathers>(way); }
 
 // The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {

@@ -16,9 +16,9 @@ namespace darswin {
 // X is the type of the tokens. If X is float, a word is one float, and the only parameter of a
 // column is its bias. If X is uint8_t, a word holds the weights of four depths as signed 8 bits.
 // The parameters are then the bias, the size of a step of the weights, and the int32 that is added
-// to the sum to undo the zero point of the tokens. Three words follow the panels: the size of a
-// step of the tokens, and their Quantizer.
-constexpr int64_t kPanel = 48, kPanelUnit = 16;
+// to the sum to undo the zero point of the tokens. kLastWords words follow the panels: the size of
+// a step of the tokens, and their Quantizer. The operator _pack_linear packs layers.
+constexpr int64_t kPanel = 48, kPanelUnit = 16, kLastWords = 3;
 // Kernels read whole words, so they may read this many bytes beyond the last token.
 constexpr int64_t kSpare = 3;
 // The greatest depth of 8 bits: no sum overflows.

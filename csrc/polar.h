@@ -1,4 +1,4 @@
-// The interface between the drivers of polar_sample and polar_embed and their kernels.
+// The interface between the driver of polar_sample and its kernels.
 #pragma once
 
 #include <cstdint>
@@ -18,10 +18,10 @@ struct PolarSampleArgs {
   Pixel pixel;
   int64_t channels, height, width;
   int64_t image_stride[4];
-  bool packed;            // samples come from a packed copy of the image in the cache
+  bool packed;            // samples come from a packed copy of the image, else directly from it
   bool gathers;           // pixels are read by gathers
-  const T* pixel_scale;   // (C,): a pixel p of type u8 has the value p * scale + offset
-  const T* pixel_offset;  // (C,)
+  const T* pixel_scale;   // (C,), followed by three zeros: a pixel p of type u8 has the value
+  const T* pixel_offset;  // p * scale + offset; the same
   const T* radii;         // (B or 1, num_radii) px
   int64_t radii_stride, num_radii;
   const double* cosines;   // (num_azimuths,), followed by one readable register
@@ -56,10 +56,8 @@ struct PolarSampleArgs {
 // kAffine.
 enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kAffine, kLensSums = kAffine + 4 };
 
-// The purpose of a kernel's scratch memory. `forward` makes samples, also for the gradient of
-// polar_embed's weight. The others bring the gradients of the samples to the image, to the lens or,
-// in polar_embed, to memory.
-enum class PolarPass { forward, backward_image, backward_lens, backward_samples };
+// The purpose of a kernel's scratch memory.
+enum class PolarPass { forward, backward_image, backward_lens };
 
 // Kernels process the items [begin, end) on one thread. The drivers own the threads.
 template <typename T>
@@ -78,52 +76,7 @@ struct PolarSampleKernels {
   void (*backward_lens)(const Args&, int64_t begin, int64_t end, void* scratch);
 };
 
-// Sampling followed by a linear layer: out = samples of the token * weight^T + bias. PolarEmbedArgs
-// holds the arguments that PolarSampleArgs lacks. The layout of the sampling is then tokens, and
-// its out and grad_out are (B, R, A, D). "Padded" sizes are multiples of kRowUnit, so that rows are
-// whole registers on every tier.
-constexpr int64_t kRowUnit = 16;
-template <typename T>
-struct PolarEmbedArgs {
-  int64_t features = 0;           // D
-  const T* transposed = nullptr;  // forward: the weight as (S_r * S_phi * C, padded D)
-  const T* bias = nullptr;        // (D,) or null
-  const T* weight = nullptr;      // backward: (D, padded S_r * S_phi * C)
-  T* grad_samples = nullptr;      // (B, R, A, S_r * S_phi * C)
-};
-
-template <typename T>
-struct PolarEmbedKernels {
-  using Args = PolarSampleArgs<T>;
-  using Embed = PolarEmbedArgs<T>;
-
-  // bytes of scratch for each thread that runs one of the functions below
-  int64_t (*scratch)(const Args&, const Embed&, PolarPass);
-  // item: (image, ring)
-  void (*forward)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
-  // item: (image, ring); adds to weight (D, padded S_r * S_phi * C) and bias (D,)
-  void (*backward_weight)(const Args&, const Embed&, int64_t begin, int64_t end, T* weight,
-                          double* bias, void* scratch);
-  // item: (image, ring); writes grad_samples
-  void (*backward_samples)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
-  // item: image, as one band; the gradients of the samples go straight to the image
-  void (*backward_image)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
-};
-
 namespace {
-
-// Returns the number of values in the kernels' packed image. It is a double, because it may not fit
-// 64 bits.
-inline double packed_values(int64_t height, int64_t width, int64_t channels) {
-  return static_cast<double>(height + 3) * static_cast<double>(width + 3) *
-         static_cast<double>((channels + 3) / 4 * 4);
-}
-
-// Returns whether an image is packed: if its copy takes so few bytes that it stays in the
-// second-level cache, and if it has few pixels for each point.
-inline bool worth_packing(double bytes, double pixels, double points) {
-  return bytes <= 3 << 19 && pixels <= 4 * points;
-}
 
 // The steps by which jitter moves a point from radius i. The radius becomes radii[i] + shift *
 // (radii[above] - radii[below]). A negative shift uses entry 0 of both arrays, other shifts use

@@ -1,4 +1,4 @@
-// One call of polar_sample or polar_embed: checks its arguments and lays them out for the kernels.
+// One call of polar_sample: checks its arguments and lays them out for the kernels.
 #pragma once
 
 #include <numeric>
@@ -13,7 +13,7 @@
 
 namespace darswin {
 
-// The arguments that polar_sample and polar_embed share, in the order of their schemas.
+// The arguments that polar_sample and its backward share, in the order of their schemas.
 struct Sampling {
   Tensor image, radii, azimuths, center;
   MaybeTensor affine, offsets, jitter, seed;
@@ -22,6 +22,9 @@ struct Sampling {
   bool bfloat16;  // the type of the output
 };
 
+// An image is packed if its copy takes at most this many bytes, so that it stays in the
+// second-level cache, and if it has at most this many pixels for each point.
+constexpr double kPackedBytes = 3 << 19, kPackedPixels = 4;
 // Up to this size (1 MB of float32), CPUs that are not from Intel read gray images faster by
 // gathers.
 constexpr int64_t kGatheredPixels = 1 << 18;
@@ -50,11 +53,6 @@ T single(const Tensor& tensor, ScalarType type, const char* what) {
                   "polar_sample: ", what, " must be one number on the CPU");
   return *pointer<T>(tensor);
 }
-
-// The gradients that backward should compute. Radii, center and affine share one flag.
-struct PolarWanted {
-  bool image, lens, offsets;
-};
 
 // The gradients of the sampling. Unwanted gradients are empty tensors.
 struct PolarGradients {
@@ -160,12 +158,12 @@ struct PolarCall {
     return grad;
   }
 
-  // Computes the wanted gradients from args.grad_out.
-  PolarGradients backward(const PolarWanted& wanted) {
+  // Computes the wanted gradients from args.grad_out. Radii, center and affine share one flag.
+  PolarGradients backward(bool image_grad, bool lens_grad, bool offsets_grad) {
     const int64_t images = sampled_images();
     const auto& kernel = kernels<PolarSampleKernels<T>>();
     PolarGradients grads = no_gradients();
-    if (wanted.image) {
+    if (image_grad) {
       grads.image = new_image_gradient();
       args.bands = count_bands();
       if (images > 0 && grads.image.numel() > 0) {
@@ -174,8 +172,8 @@ struct PolarCall {
                          [&](auto... range) { kernel.backward_image(args, range...); });
       }
     }
-    const bool to_offsets = wanted.offsets && offsets;
-    if (!wanted.lens && !to_offsets) return grads;
+    const bool to_offsets = offsets_grad && offsets;
+    if (!lens_grad && !to_offsets) return grads;
     if (to_offsets) {
       grads.offsets = new_zeros(*offsets, offsets->sizes());
       args.grad_offsets = mutable_pointer<T>(grads.offsets);
@@ -196,7 +194,7 @@ struct PolarCall {
     };
     run_with_scratch(images * rings() / sharing, threads_for(microseconds()),
                      kernel.scratch(args, PolarPass::backward_lens), rings_of_images);
-    if (wanted.lens) fold_lens(sums, grads);
+    if (lens_grad) fold_lens(sums, grads);
     return grads;
   }
 
@@ -238,6 +236,7 @@ struct PolarCall {
       scale.push_back(static_cast<T>(1 / (255 * given.std[c])));
       offset.push_back(static_cast<T>(-given.mean[c] / given.std[c]));
     }
+    scale.resize(channels + 3), offset.resize(channels + 3);
     args.pixel_scale = scale.data();
     args.pixel_offset = offset.data();
   }
@@ -263,17 +262,21 @@ struct PolarCall {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =
         static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
-    args.packed = worth_packing(packed_values() * sizeof(T), pixels, points);
+    // A packed image of 8 bits needs a channel for its coverage.
+    args.packed = packed_values() * sizeof(T) <= kPackedBytes && pixels <= kPackedPixels * points &&
+                  (args.pixel != Pixel::u8 || args.channels < 4);
     const bool gray = args.channels == 1;
     const bool possible = current_tier() == Tier::avx512 && !args.packed &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
                           (gray || args.channels == 3);
-    const bool faster = cpu_is_intel() || (gray && pixels <= kGatheredPixels);
-    args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
+    args.gathers = possible && (cpu_is_intel() || (gray && pixels <= kGatheredPixels));
   }
 
+  // Returns the number of values in the kernels' packed image. It is a double, because it may not
+  // fit 64 bits.
   double packed_values() const {
-    return darswin::packed_values(args.height, args.width, args.channels);
+    return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
+           static_cast<double>(round_up(args.channels, 4));
   }
 
   // Adds up the sums of each row of points into the gradients of radii, center and affine.

@@ -18,17 +18,17 @@ int64_t largest_divisor(int64_t number, int64_t most) {
 }
 
 // An image has no tokens, so the driver chooses the pieces that the kernels treat as tokens. For a
-// near image, a piece is one radius, whose samples stay in the first-level cache. For a far image,
-// pieces are about square, so that their points share pixels.
+// packed image, a piece is one radius, whose samples stay in the first-level cache. For an image
+// that is read directly, pieces are about square, so that their points share pixels.
 template <typename T>
 void choose_layout(PolarSampleArgs<T>& args, bool tokens) {
   constexpr int64_t kSide = 16;
   args.tokens = tokens;
   if (tokens) return;
-  const bool near = args.packed;
-  args.samples_r = near ? 1 : largest_divisor(args.num_radii, kSide);
+  const bool packed = args.packed;
+  args.samples_r = packed ? 1 : largest_divisor(args.num_radii, kSide);
   args.samples_a =
-      near ? std::max<int64_t>(args.num_azimuths, 1) : largest_divisor(args.num_azimuths, kSide);
+      packed ? std::max<int64_t>(args.num_azimuths, 1) : largest_divisor(args.num_azimuths, kSide);
 }
 
 template <typename T>
@@ -52,7 +52,7 @@ auto backward(PolarCall<T>& call, bool tokens, Tensor grad, bool image_grad, boo
   choose_layout(call.args, tokens);
   grad = checked_gradient(grad, output_sizes(call), call.output_type(), "polar_sample");
   call.args.grad_out = grad.const_data_ptr();
-  return call.backward({image_grad, lens_grad, offsets_grad}).tuple();
+  return call.backward(image_grad, lens_grad, offsets_grad).tuple();
 }
 
 using Forward = Listed<forward<float>, forward<double>>;

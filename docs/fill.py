@@ -35,7 +35,6 @@ SUITES = ("sampling", "to_image", "attention", "model", "one_frame", "frames")
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 FRAME_PEERS = ("eager model", "ONNX Runtime", "OpenVINO", "AOTInductor package")
 IMAGE_PEERS = ("F.pad + F.grid_sample",)
-EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
 # The rows of the tables of speed, the README's first: subject, mode, setting, batch.
 README_SPEED = (
     ("polar_sample", "forward", "256×256", 8),
@@ -49,7 +48,6 @@ README_SPEED = (
 )
 SPEED = (
     *README_SPEED,
-    ("polar_embed", "forward", "256×256", 8),
     ("window_attention", "forward", "A stage 1", 32),
     ("darswin_a_small", "inference, bfloat16", "64×64", 8),
 )
@@ -161,7 +159,6 @@ def tables() -> dict[str, str]:
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
         "sampling": peers.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
-        "embedding": peers.peers_table(sampling.timings, "polar_embed", EMBED_PEERS),
         "to image": peers.peers_table(
             to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)
         ),

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from darswin.data import LEVELS, SphericalLenses, WideAngle
 from darswin.data.pictures import Arrays
-from darswin.data.wide_angle import PAPER_FOV
-from darswin.lens import Spherical
+from darswin.data.samples import Draw
 from darswin.viz.plot import TEXT, page_figure, save_figure
 
 SIDE, SQUARE = 1536, 64  # px
@@ -39,8 +38,7 @@ def draw_levels() -> Figure:
         pictures = WideAngle(
             source, SphericalLenses(xi, xi), size=size, render=4 * size, picture_size=SIDE
         )
-        lens = Spherical.from_fov(xi, PAPER_FOV, size / 2)
-        axes.imshow(pictures.through(lens, source[0][0]))
+        axes.imshow(pictures.shown(Draw(0, 0, 0)).image)
         axes.set_title(f'"{level}"\nξ = {xi:.3g}', fontsize=TEXT)
         axes.axis("off")
     return figure

@@ -29,7 +29,7 @@ from worlds.wad import load_map, map_names
 from darswin.data import open_scenes
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.solve import vector_of
-from darswin.train.pixel_metrics import DistanceSums
+from darswin.train.distance import DistanceSums
 from darswin.utils.files import replace_file
 
 BOUNDS = ("gravity", "labels", "heights")

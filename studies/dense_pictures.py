@@ -26,7 +26,7 @@ def predict(run: Path, data: Path, task: str) -> None:
     for name, place in SHOWN.items():
         scenes = open_scenes(str(data / "test" / name), "test", TARGETS[task])
         mean, std = card.options["mean"], card.options["std"]
-        test = SceneSamples(scenes, size=card.size, framing=card.fit, mean=mean, std=std)
+        test = SceneSamples(scenes, size=card.size, fit=card.fit, mean=mean, std=std)
         image, lens, _ = test[min(place, len(test) - 1)]
         with torch.inference_mode():
             found = model(image[None], lens)[0]

@@ -20,7 +20,8 @@ import torch
 
 from darswin.data import IGNORE, open_scenes
 from darswin.lens.pixels import pixel_rays
-from darswin.train.pixel_metrics import DistanceSums, LabelSums
+from darswin.train.distance import DistanceSums
+from darswin.train.segmentation import LabelSums
 from darswin.utils.files import replace_file
 
 RINGS, SECTORS = 9, 16  # of 10° and 22.5°; the last ring has all that is further out

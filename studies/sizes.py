@@ -23,8 +23,7 @@ from sizes_tables import SHUFFLED, WRONG, collect, publish
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.train.losses import distance_loss
-from darswin.train.pixel_metrics import DistanceSums
+from darswin.train.distance import DistanceSums, distance_loss
 from darswin.utils.files import replace_file
 
 CHUNK = 600  # pictures in a file

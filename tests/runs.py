@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from darswin.cli.main import main
-from darswin.train.task import Task
+from darswin.train.task import TaskModule
 
 QUIET = """--data.workers 0 --trainer.enable_progress_bar false
     --trainer.enable_model_summary false""".split()  # noqa: SIM905
@@ -73,7 +73,7 @@ class KilledError(BaseException):
     """Nothing that the program knows, as a kill is."""
 
 
-STEP = Task.training_step
+STEP = TaskModule.training_step
 
 
 def patch_batch(monkeypatch, number: int, action) -> None:
@@ -84,7 +84,7 @@ def patch_batch(monkeypatch, number: int, action) -> None:
         other = action(self) if next(counts) == number else None
         return STEP(self, batch, batch_idx) if other is None else other
 
-    monkeypatch.setattr(Task, "training_step", acting)
+    monkeypatch.setattr(TaskModule, "training_step", acting)
 
 
 def killed_fit(monkeypatch, run: Path, number: int, *options) -> None:
@@ -96,4 +96,4 @@ def killed_fit(monkeypatch, run: Path, number: int, *options) -> None:
     patch_batch(monkeypatch, number, kill)
     with pytest.raises(KilledError):
         fit(run, *options)
-    monkeypatch.setattr(Task, "training_step", STEP)
+    monkeypatch.setattr(TaskModule, "training_step", STEP)

@@ -44,12 +44,10 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlo
   }
 }
 
-template <Blend blend>
 void write_border(const FrameArgs& a, const BorderPoint& point) {
   const int64_t channels = a.image.channels, k = point.index;
   for (int64_t c = 0; c < channels; ++c) {
-    const float v =
-        border_sample<blend>(a.image, point.column, point.row, point.right, point.lower, c);
+    const float v = border_sample(a.image, point.column, point.row, point.right, point.lower, c);
     if (a.output == FrameOutput::planes) {
       static_cast<float*>(a.out)[c * a.points + k] = v;
     } else if (a.output == FrameOutput::tokens) {
@@ -60,15 +58,14 @@ void write_border(const FrameArgs& a, const BorderPoint& point) {
   }
 }
 
-template <Blend blend>
-void sample_points(const FrameArgs& a, int64_t begin, int64_t end) {
+void sample(const FrameArgs& a, int64_t begin, int64_t end) {
   alignas(64) ByteBlock block;
   // A frame of one row or column has no four neighbours: all its points are border points.
   const bool neighbours = a.image.height > 1 && a.image.width > 1;
   for (int64_t k = begin; k < end && neighbours; k += kByteBlock) {
     const int64_t count = smaller(kByteBlock, end - k);
     find_offsets(a, k, count, block.offset);
-    block.sample<blend>(a.image, a.right + k, a.lower + k, count);
+    block.sample(a.image, a.right + k, a.lower + k, count);
     write_block(a, k, count, block);
   }
   int64_t low = 0, high = a.border_points;  // finds the first border point from `begin` on
@@ -77,20 +74,7 @@ void sample_points(const FrameArgs& a, int64_t begin, int64_t end) {
     a.border[middle].index < begin ? low = middle + 1 : high = middle;
   }
   for (; low < a.border_points && a.border[low].index < end; ++low) {
-    write_border<blend>(a, a.border[low]);
-  }
-}
-
-void sample(const FrameArgs& a, int64_t begin, int64_t end) {
-  switch (a.blend) {
-    case Blend::raw:
-      return sample_points<Blend::raw>(a, begin, end);
-    case Blend::far:
-      return sample_points<Blend::far>(a, begin, end);
-    case Blend::near:
-      return sample_points<Blend::near>(a, begin, end);
-    case Blend::near_rows:
-      return sample_points<Blend::near_rows>(a, begin, end);
+    write_border(a, a.border[low]);
   }
 }
 
@@ -103,12 +87,12 @@ void places(PolarSampleArgs<float> a, double* angles, int64_t padded, int16_t* c
   for (int64_t i = 0; i < a.num_radii; ++i) {
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j), to = i * a.num_azimuths + j;
-      points.find_far<true>(a, strides, 0, i, j, count, 0);
+      points.find_direct<true>(a, strides, 0, i, j, count, 0);
       for (int64_t k = 0; k < count; ++k) {
-        columns[to + k] = static_cast<int16_t>(points.far.column[k]);
-        rows[to + k] = static_cast<int16_t>(points.far.row[k]);
-        right[to + k] = points.far.right[k];
-        lower[to + k] = points.far.lower[k];
+        columns[to + k] = static_cast<int16_t>(points.direct.column[k]);
+        rows[to + k] = static_cast<int16_t>(points.direct.row[k]);
+        right[to + k] = points.direct.right[k];
+        lower[to + k] = points.direct.lower[k];
       }
     }
   }

@@ -1,4 +1,4 @@
-// Bilinear samples of an 8-bit image with one or three channels, in place.
+// Bilinear samples of an 8-bit image with one or three channels, which is read directly.
 //
 // Points are sampled in blocks. The first step only reads: it copies the pixels around each point
 // to short arrays, one machine word for several channels where their bytes are neighbours. These
@@ -7,44 +7,12 @@
 #pragma once
 
 #include "../frames.h"
-#include "polar_far.h"
+#include "polar_direct.h"
 
 namespace darswin {
 namespace {
 
-// Interpolation uses weights, (1 - t) * a + t * b, or differences, a + t * (b - a). Differences
-// overflow between huge values and give NaN between infinite values. Weights cost more, except in
-// registers of 512 bits, which hold four points. So the other tiers try differences first. If a
-// sample is not finite, they compute the whole block of points again with weights. The other
-// samples of the block may then differ in their last bit.
-template <typename T>
-constexpr bool kTryDifferences = is_same_v<T, float> && kRegister < 64;
-
 constexpr int64_t kByteBlock = 256;  // points; their words stay in the first-level cache
-
-// Interpolates from a to b, in one of these two forms.
-template <bool kWeights, typename V>
-inline V between(V a, V b, V t) {
-  if constexpr (kWeights) {
-    return between(a, b, 1 - t, t);
-  } else {
-    return a + t * (b - a);
-  }
-}
-
-// The same by the rule of `blend`. 8-bit pixels are finite, so differences always do.
-template <Blend blend, typename V>
-inline V along(V a, V b, V t) {
-  constexpr bool differences = blend == Blend::near_rows && kTryDifferences<float>;
-  return between<!differences>(a, b, t);
-}
-
-template <Blend blend, typename V>
-inline V bilinear(V top_left, V top_right, V bottom_left, V bottom_right, V right, V lower) {
-  const V l = along<blend>(top_left, bottom_left, lower);
-  const V r = along<blend>(top_right, bottom_right, lower);
-  return along<blend>(l, r, right);
-}
 
 // A corner of the points of a block: 8 bits of each word.
 struct Corner {
@@ -66,7 +34,6 @@ struct ByteBlock {
 
   // Samples points of an image. `offset` has those of their upper left pixels, whose neighbours are
   // in the image too. Up to a register of `right` and `lower` is read behind the last point.
-  template <Blend blend>
   void sample(const ByteImage& image, const float* right, const float* lower, int64_t count) {
     const int64_t below = image.row_stride, next = image.column_stride,
                   plane = image.channel_stride;
@@ -82,8 +49,8 @@ struct ByteBlock {
       }
       for (int c = 0; c < 3; ++c) {
         const int shift = 8 * (plane == 1 ? c : 2 - c);
-        compute<blend>(image, c, {words[0], shift}, {words[1], shift + 8}, {words[2], shift},
-                       {words[3], shift + 8}, right, lower, count);
+        compute(image, c, {words[0], shift}, {words[1], shift + 8}, {words[2], shift},
+                {words[3], shift + 8}, right, lower, count);
       }
       return;
     }
@@ -97,8 +64,8 @@ struct ByteBlock {
           words[0][k] = top[0] | top[next] << 8, words[2][k] = bottom[0] | bottom[next] << 8;
         }
       }
-      compute<blend>(image, c, {words[0], 0}, {words[0], 8}, {words[2], 0}, {words[2], 8}, right,
-                     lower, count);
+      compute(image, c, {words[0], 0}, {words[0], 8}, {words[2], 0}, {words[2], 8}, right, lower,
+              count);
     }
   }
 
@@ -127,40 +94,34 @@ struct ByteBlock {
 
  private:
   // Computes the samples of channel c.
-  template <Blend blend>
   void compute(const ByteImage& image, int64_t c, Corner top_left, Corner top_right,
                Corner bottom_left, Corner bottom_right, const float* right, const float* lower,
                int64_t count) {
-    const float scale = image.scale[c], shift = image.offset[c];
-    const auto value = [&](const Corner& corner, int64_t k) {
-      const Floats v = corner.read(k);
-      if constexpr (blend == Blend::near || blend == Blend::near_rows) return v * scale + shift;
-      return v;
-    };
+    const auto scale = splat<Floats>(image.scale[c]), shift = splat<Floats>(image.offset[c]);
     for (int64_t k = 0; k < count; k += kLanes<float>) {
-      Floats v =
-          bilinear<blend>(value(top_left, k), value(top_right, k), value(bottom_left, k),
-                          value(bottom_right, k), load<Floats>(right + k), load<Floats>(lower + k));
-      if constexpr (blend == Blend::far) v = v * scale + shift;
-      store(samples[c] + k, v);
+      const Floats v =
+          bilinear(top_left.read(k), top_right.read(k), bottom_left.read(k), bottom_right.read(k),
+                   load<Floats>(right + k), load<Floats>(lower + k));
+      store(samples[c] + k, normalized(v, scale, shift));
     }
   }
 };
 
-// Returns channel c of a sample at the border or outside. Pixels outside count as 0, after the
-// normalization.
-template <Blend blend>
-float border_sample(const ByteImage& image, int64_t column, int64_t row, float right, float lower,
-                    int64_t c) {
-  if (column < -1 || column >= image.width || row < -1 || row >= image.height) return 0;
-  const auto value = [&](int64_t y, int64_t x) {
-    if (y < 0 || y >= image.height || x < 0 || x >= image.width) return 0.0f;
-    const float v =
-        image.pixels[y * image.row_stride + x * image.column_stride + c * image.channel_stride];
-    return blend == Blend::raw ? v : v * image.scale[c] + image.offset[c];
+// Returns channel c of a sample at the border or outside.
+inline float border_sample(const ByteImage& image, int64_t column, int64_t row, float right,
+                           float lower, int64_t c) {
+  const auto interpolate = [&](auto value) {
+    const auto at = [&](int64_t y, int64_t x) {
+      const bool inside = y >= 0 && y < image.height && x >= 0 && x < image.width;
+      return inside ? value(y * image.row_stride + x * image.column_stride) : 0.0f;
+    };
+    return bilinear(at(row, column), at(row, column + 1), at(row + 1, column),
+                    at(row + 1, column + 1), right, lower);
   };
-  return bilinear<blend>(value(row, column), value(row, column + 1), value(row + 1, column),
-                         value(row + 1, column + 1), right, lower);
+  const uint8_t* pixels = image.pixels + c * image.channel_stride;
+  const float sample = interpolate([&](int64_t offset) -> float { return pixels[offset]; });
+  return normalized(sample, image.scale[c], image.offset[c],
+                    interpolate([](int64_t) { return 1.0f; }));
 }
 
 }  // namespace

@@ -1,12 +1,17 @@
-// Reads pixels, of near and of far images.
+// Reads pixels, packed or directly.
 //
-// A near image fits the second-level cache, and its pixels are first copied into a packed image.
-// There the channels come last and are padded to four, so that one load takes a pixel and its right
+// If an image fits the second-level cache, its pixels are first copied into a packed image. There
+// the channels come last and are padded to four, so that one load takes a pixel and its right
 // neighbour. A border of zeros surrounds the image, so that the inner loop needs no bounds test. A
 // point outside the image reads the zeros at the lower right, where the border is two pixels wide.
 //
-// A far image is larger, or has too few points to be worth a copy. It is read in place, with any
+// An image that is larger, or has too few points to be worth a copy, is read directly, with any
 // strides and any type of pixel.
+//
+// 8-bit pixels are interpolated first, and the sample is normalized. Pixels outside count as 0
+// after the normalization. So a sample is scale * (its pixels) + offset * (its coverage), where the
+// coverage is the sum of the weights of the pixels inside: exactly 1 if all are. A packed image of
+// 8 bits has the coverage of each pixel, 1, as a further channel.
 #pragma once
 
 #include "convert.h"
@@ -33,7 +38,7 @@ struct Packed {
         size((a.height + 3) * row) {}
 };
 
-// The positions of a block of points among the pixels. `right` and `lower` are the distances of a
+// The places of a block of points among the pixels. `right` and `lower` are the distances of a
 // point from its upper left pixel, to the right and downwards, from 0 to 1. The last register of a
 // row may reach beyond the row.
 constexpr int kPlaces = kBlock + kDoubles;
@@ -46,7 +51,7 @@ struct PackedPlaces : Places<T> {
   int32_t offset[kPlaces];  // of the upper left pixel in the packed image
 };
 template <typename T>
-struct FarPlaces : Places<T> {
+struct DirectPlaces : Places<T> {
   int64_t column[kPlaces], row[kPlaces];  // of the upper left pixel
   int64_t offset[kPlaces];                // its offset, or -1 if not all four are inside
 };
@@ -74,12 +79,12 @@ inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Point
   store(places.offset + k, to_ints(offset));
 }
 
-// Places points in a far image. A point that touches no pixel gets column or row -3. `strides` are
-// the strides of the rows and the columns that are read or written. If all four pixels of every
-// point are known to be `inside`, the columns and rows are not computed.
+// Places points in an image that is read directly. A point that touches no pixel gets column or row
+// -3. `strides` are the strides of the rows and the columns that are read or written. If all four
+// pixels of every point are known to be `inside`, the columns and rows are not computed.
 template <bool inside, typename T>
 inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const Points& p, int64_t k,
-                  FarPlaces<T>& places) {
+                  DirectPlaces<T>& places) {
   using Ints = Vector<int64_t, kDoubles>;
   const double width = static_cast<double>(a.width), height = static_cast<double>(a.height);
   const Doubles column = split<inside>(p.x, width, -2, places.right + k) - 1;
@@ -95,36 +100,41 @@ inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const P
   store(places.offset + k, __builtin_convertvector(offset, Ints));
 }
 
-// The positions of a block of points, in a packed image or in a far one.
+// The places of a block of points, in a packed image or for reading directly.
 template <typename T>
 struct PlacedPoints {
   union {
-    PackedPlaces<T> near;
-    FarPlaces<T> far;
+    PackedPlaces<T> packed;
+    DirectPlaces<T> direct;
   };
   RandomWords random;
 
-  // Finds points j to j + count of radius i of image b, and stores them starting at place `first`.
-  void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
-            int64_t count, int64_t first) {
+  // Finds points j to j + count of radius i of image b, and stores them from index `first` on.
+  void find_packed(const PolarSampleArgs<T>& a, const Packed& layout, int64_t b, int64_t i,
+                   int64_t j, int64_t count, int64_t first) {
     const auto put = [&]<bool inside>() {
       locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<inside>(a, packed, p, first + k, near); });
+             [&](int64_t k, const Points& p) { place<inside>(a, layout, p, first + k, packed); });
     };
     within(a, b, i, -1) ? put.template operator()<true>() : put.template operator()<false>();
   }
 
-  // Does the same in the far image, with or without the columns and rows of points inside it.
+  // Does the same for reading directly, with or without the columns and rows of points inside.
   template <bool columns>
-  void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
-                int64_t j, int64_t count, int64_t first) {
-    constexpr double kSpare = 0.001;  // of a pixel, because positions are rounded
+  void find_direct(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
+                   int64_t j, int64_t count, int64_t first) {
     const auto put = [&]<bool inside>() {
       locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<inside>(a, strides, p, first + k, far); });
+             [&](int64_t k, const Points& p) { place<inside>(a, strides, p, first + k, direct); });
     };
-    const bool inside = !columns && within(a, b, i, kSpare);
-    inside ? put.template operator()<true>() : put.template operator()<false>();
+    const bool known = !columns && inside(a, b, i);
+    known ? put.template operator()<true>() : put.template operator()<false>();
+  }
+
+  // Returns whether all four pixels around each point of a radius are known to be in the image.
+  static bool inside(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
+    constexpr double kSpare = 0.001;  // of a pixel, because positions are rounded
+    return within(a, b, i, kSpare);
   }
 
  private:
@@ -140,17 +150,17 @@ struct PlacedPoints {
   }
 };
 
-// Points of a far image that are visited in turn. Their places in a block are place, place + step
-// and so on.
+// Points that are read directly, in turn. Their indices in a block are first, first + step and so
+// on.
 struct Line {
   bool flat;                   // true: along the azimuth, false: along the radius
-  int64_t row, token, sample;  // of the first point: its radius in the block, its place in a token
-  int64_t place, step, count;
+  int64_t row, token, sample;  // of the first point: its radius in the block, its index in a token
+  int64_t first, step, count;
 };
 
-// Cuts a block of a far image into lines. The block has `rows` radii with points j to j + columns
-// each. Lines go token by token, with `token_width` points of each radius. Inside a token they go
-// along the azimuth.
+// Cuts a block that is read directly into lines. The block has `rows` radii with points j to j +
+// columns each. Lines go token by token, with `token_width` points of each radius. Inside a token
+// they go along the azimuth.
 //
 // An image of several planes is different: few of its points fill a set of the cache. There, lines
 // follow the rows of the image, so that a point finds cache lines that the point before has
@@ -214,10 +224,10 @@ void visit_lines(const Lines<T>& all, Fetch fetch, Visit visit) {
 // Prefetches the pixels around the points of a line, in `planes` planes whose rows are `below`
 // apart.
 template <typename T, typename E>
-void fetch_pixels(const FarPlaces<T>& places, const Line& line, const E* pixels, int64_t planes,
+void fetch_pixels(const DirectPlaces<T>& places, const Line& line, const E* pixels, int64_t planes,
                   int64_t plane, int64_t below) {
   for (int64_t k = 0; k < line.count; ++k) {
-    const int64_t offset = places.offset[line.place + k * line.step];
+    const int64_t offset = places.offset[line.first + k * line.step];
     for (int64_t c = 0; c < planes && offset >= 0; ++c) {
       fetch(pixels + c * plane + offset);
       fetch(pixels + c * plane + offset + below);
@@ -239,15 +249,22 @@ void with_pixel_type(Pixel pixel, Visit visit) {
   }
 }
 
-// Returns the value of a pixel. Pixels of type uint8 have a scale and an offset for each channel;
-// other pixels are used as they are. Interpolation may come before or after this step.
-template <typename E, typename T>
-inline T normalized(const PolarSampleArgs<T>& a, T pixel, int64_t channel) {
-  return is_same_v<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
+// Interpolates between four pixels, at distances from 0 to 1 from the upper left one.
+template <typename V>
+inline V bilinear(V top_left, V top_right, V bottom_left, V bottom_right, V right, V lower) {
+  const V l = between(top_left, bottom_left, 1 - lower, lower);
+  const V r = between(top_right, bottom_right, 1 - lower, lower);
+  return between(l, r, 1 - right, right);
 }
-template <typename T, typename E>
-inline T value(const PolarSampleArgs<T>& a, const E* pixel, int64_t channel) {
-  return normalized<E>(a, load<T>(pixel), channel);
+
+// Normalizes a sample of 8-bit pixels. At the border, its offset counts by the sample's coverage.
+template <typename V>
+inline V normalized(V sample, V scale, V offset) {
+  return sample * scale + offset;
+}
+template <typename V>
+inline V normalized(V sample, V scale, V offset, V coverage) {
+  return normalized(sample, scale, unfused(offset * coverage));
 }
 
 // Interleaves four planes: (4, width) -> (width, 4).
@@ -264,17 +281,26 @@ void interleave(const T* const plane[4], int64_t width, T* to) {
   }
 }
 
-// Packs image b. `planes` has room for 4 rows of the image.
+// Packs image b. `planes` has room for 4 rows of the image. Channels beyond those of the image are
+// 0, or 1 for pixels of 8 bits.
 template <typename T, typename E>
 void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* planes, T* to) {
+  constexpr T kBeyond = is_same_v<E, uint8_t>;
   const E* image = static_cast<const E*>(a.image) + b * a.image_stride[0];
   const int64_t channel_stride = a.image_stride[1], column_stride = a.image_stride[3];
+  const bool pixelwise = column_stride != 1 && packed.pixel == 4;
   for (int64_t y = 0; y < a.height; ++y) {
     const E* from = image + y * a.image_stride[2];
     T* row = to + (y + 1) * packed.row;
     for (int64_t e = 0; e < packed.pixel; ++e) row[e] = 0;
     row += packed.pixel;
-    for (int64_t first = 0; first < a.channels; first += 4) {
+    for (int64_t x = 0; x < a.width && pixelwise; ++x) {
+      const E* pixel = from + x * column_stride;
+      for (int64_t c = 0; c < 4; ++c) {
+        row[4 * x + c] = c < a.channels ? load<T>(pixel + c * channel_stride) : kBeyond;
+      }
+    }
+    for (int64_t first = 0; first < a.channels && !pixelwise; first += 4) {
       // Four channels as planes. A plane points into the image if it can be read as it is, and to a
       // converted copy otherwise.
       const T* plane[4];
@@ -282,7 +308,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
         T* copy = planes + c * a.width;
         plane[c] = copy;
         if (first + c >= a.channels) {
-          for (int64_t x = 0; x < a.width; ++x) copy[x] = 0;
+          for (int64_t x = 0; x < a.width; ++x) copy[x] = kBeyond;
           continue;
         }
         const E* source = from + (first + c) * channel_stride;
@@ -292,9 +318,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
             continue;
           }
         }
-        for (int64_t x = 0; x < a.width; ++x) {
-          copy[x] = value(a, source + x * column_stride, first + c);
-        }
+        for (int64_t x = 0; x < a.width; ++x) copy[x] = load<T>(source + x * column_stride);
       }
       if (packed.pixel == 4) {
         interleave(plane, a.width, row);
@@ -311,7 +335,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
   for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
 }
 
-// The four pixels around a point of a far image, read one channel at a time. Any of them may lie
+// The four pixels around a point, read directly, one channel at a time. Any of them may lie
 // outside.
 template <typename T, typename E>
 struct Corners {
@@ -336,11 +360,41 @@ struct Corners {
   Vector<T, 4> read(int64_t channel) const {
     const E* p = image + first + channel * args.image_stride[1];
     const int64_t row = args.image_stride[2], column = args.image_stride[3];
-    const T top_left = upper && left ? value(args, p, channel) : T(0);
-    const T top_right = upper && right ? value(args, p + column, channel) : T(0);
-    const T bottom_left = lower && left ? value(args, p + row, channel) : T(0);
-    const T bottom_right = lower && right ? value(args, p + row + column, channel) : T(0);
+    const T top_left = upper && left ? load<T>(p) : T(0);
+    const T top_right = upper && right ? load<T>(p + column) : T(0);
+    const T bottom_left = lower && left ? load<T>(p + row) : T(0);
+    const T bottom_right = lower && right ? load<T>(p + row + column) : T(0);
     return Vector<T, 4>{top_left, top_right, bottom_left, bottom_right};
+  }
+
+  // Returns 1 for each of these pixels that is inside, and 0 for the others.
+  Vector<T, 4> inside() const {
+    return Vector<T, 4>{T(upper && left), T(upper && right), T(lower && left), T(lower && right)};
+  }
+
+  // Returns the values of the four pixels: those of 8 bits are normalized.
+  Vector<T, 4> values(int64_t channel) const {
+    if constexpr (is_same_v<E, uint8_t>) {
+      using V = Vector<T, 4>;
+      return normalized(read(channel), splat<V>(args.pixel_scale[channel]),
+                        splat<V>(args.pixel_offset[channel]), inside());
+    } else {
+      return read(channel);
+    }
+  }
+
+  // Interpolates between them. A sample of 8-bit pixels is normalized.
+  T sample(int64_t channel, T right, T lower) const {
+    const auto interpolate = [&](const Vector<T, 4>& p) {
+      return bilinear(p[0], p[1], p[2], p[3], right, lower);
+    };
+    const T sample = interpolate(read(channel));
+    if constexpr (is_same_v<E, uint8_t>) {
+      return normalized(sample, args.pixel_scale[channel], args.pixel_offset[channel],
+                        interpolate(inside()));
+    } else {
+      return sample;
+    }
   }
 };
 

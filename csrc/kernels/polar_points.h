@@ -65,7 +65,7 @@ inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words wo
 // The random words of a block of points. Point p of the image gets word p % 4 of counter p / 4.
 struct RandomWords {
   uint32_t word[kBlock + 8 * kLanes<uint64_t>];
-  int64_t first;  // place of the block's first point in `word`
+  int64_t first;  // index of the block's first point in `word`
 
   void draw(uint64_t seed, uint64_t image, uint64_t point, int64_t count) {
     constexpr int lanes = kLanes<uint64_t>;

@@ -67,9 +67,9 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples) {
 
 // Reads a row of gradients as (num_azimuths, C).
 template <typename T>
-void read_row(const PolarSampleArgs<T>& a, const void* grad, const Row& row, T* to) {
+void read_row(const PolarSampleArgs<T>& a, const Row& row, T* to) {
   with_output_type(a, [&]<typename E>() {
-    const E* from = static_cast<const E*>(grad) + row.first;
+    const E* from = static_cast<const E*>(a.grad_out) + row.first;
     const int64_t piece = a.samples_a * a.channels;
     for (int64_t j = 0; j < a.num_azimuths; j += a.samples_a, from += row.sector_stride) {
       T* sector = to + j * a.channels;

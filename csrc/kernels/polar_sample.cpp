@@ -2,7 +2,7 @@
 //
 // Forward goes through the radii of an image and samples the points of each radius. polar_points.h
 // computes the positions of the points. A small image is sampled from a packed copy in the cache, a
-// large image in place (polar_image.h).
+// large image directly (polar_image.h).
 //
 // Backward has two halves. The gradient of the image adds every point to four pixels, which other
 // points share. So each thread owns a band of rows of an image and adds to them in the order of the
@@ -23,11 +23,12 @@ void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scrat
   T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + Sampler<T>::bytes(a));
   const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
   const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, with three spare
-  const bool in_place = a.tokens && !a.narrow;
-  Sampler<T> sampler(a, in_place ? a.samples_r * piece : piece, in_place ? piece : values, scratch);
+  const bool to_output = a.tokens && !a.narrow;
+  Sampler<T> sampler(a, to_output ? a.samples_r * piece : piece, to_output ? piece : values,
+                     scratch);
   for (int64_t item = begin; item < end; ++item) {
     const int64_t b = item / rings, ring = item % rings;
-    if (in_place) {
+    if (to_output) {
       sampler.ring(b, ring, static_cast<T*>(a.out) + output_row(a, b, ring * a.samples_r).first);
       continue;
     }
@@ -44,9 +45,7 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
     const int64_t b = item / a.bands;
     Scatter<T> scatter(a, b, item % a.bands, scratch);
     for (int64_t ring = 0; ring < a.num_radii / a.samples_r; ++ring) {
-      scatter.ring(ring, [&](int64_t n, T* to) {
-        read_row(a, a.grad_out, output_row(a, b, ring * a.samples_r + n), to);
-      });
+      scatter.ring(ring);
     }
     scatter.finish();
   }
@@ -56,7 +55,7 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
 template <typename T, typename E>
 void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx, T* gy) {
   Vector<T, 4> sums{};  // of the corners, over the channels
-  for (int64_t c = 0; c < corners.args.channels; ++c) sums += grad[c] * corners.read(c);
+  for (int64_t c = 0; c < corners.args.channels; ++c) sums += grad[c] * corners.values(c);
   *gx = (sums[1] - sums[0]) * (1 - lower) + (sums[3] - sums[2]) * lower;
   *gy = (sums[2] - sums[0]) * (1 - right) + (sums[3] - sums[1]) * right;
 }
@@ -66,7 +65,7 @@ struct LensScratch {
   RandomWords random;
   double across[kPlaces], down[kPlaces], shift[kPlaces];
   double x[kPlaces], y[kPlaces];  // of points relative to the center, before the matrix
-  FarPlaces<T> places;
+  DirectPlaces<T> places;
 };
 
 template <typename T>
@@ -77,7 +76,7 @@ constexpr int64_t lens_bytes() {
 template <typename T>
 void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
   auto& points = *static_cast<LensScratch<T>*>(scratch);
-  FarPlaces<T>& places = points.places;
+  DirectPlaces<T>& places = points.places;
   T* grads = reinterpret_cast<T*>(static_cast<char*>(scratch) + lens_bytes<T>());
   for (int64_t item = begin * a.samples_r; item < end * a.samples_r; ++item) {
     const int64_t b = item / a.num_radii, i = item % a.num_radii;
@@ -85,7 +84,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     T* grad_offsets = a.grad_offsets == nullptr
                           ? nullptr
                           : a.grad_offsets + b * a.offsets_stride + i * a.num_azimuths;
-    read_row(a, a.grad_out, output_row(a, b, i), grads);
+    read_row(a, output_row(a, b, i), grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {

@@ -1,5 +1,4 @@
-// Forward of polar sampling: samples one token after another, from the packed image or, if the
-// image is far, in place.
+// Forward of polar sampling: samples one token after another, from the packed image or directly.
 //
 // Interpolation in a packed image goes first downwards, then to the right, four channels at a time.
 #pragma once
@@ -9,31 +8,33 @@
 namespace darswin {
 namespace {
 
-// Writes four channels of a sample. The arguments are the upper left and the lower left pixel;
-// their right neighbours follow them in memory. With differences, the function also adds the sample
-// to *sum.
-template <bool kWeights, typename T>
-inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to, Piece<T>* sum) {
+// Interpolates four channels of a point, and calls write(e, v) for the channels from e on. The
+// arguments are the upper left and the lower left pixel; their right neighbours follow them in
+// memory.
+template <typename T, typename Write>
+inline void interpolate(const T* pixel, const T* below, T right, T lower, Write write) {
   using V = Piece<T>;
-  const V along = splat<V>(right);
-  const auto write = [&](int e, V v) {
-    store(to + e, v);
-    if constexpr (!kWeights) *sum += v;
-  };
-  if constexpr (is_same_v<T, float> && kRegister > 16) {
-    // One load takes a pixel and its right neighbour.
-    using Pair = Vector<T, 8>;
-    const Pair pair = between<kWeights>(load<Pair>(pixel), load<Pair>(below), splat<Pair>(lower));
-    write(0, between<kWeights>(lower_half(pair), upper_half(pair), along));
-  } else {
-    const V down = splat<V>(lower);
 #pragma GCC unroll 2
-    for (int e = 0; e < 4; e += kLanes<T>) {
-      const V l = between<kWeights>(load<V>(pixel + e), load<V>(below + e), down);
-      const V r = between<kWeights>(load<V>(pixel + 4 + e), load<V>(below + 4 + e), down);
-      write(e, between<kWeights>(l, r, along));
-    }
+  for (int e = 0; e < 4; e += kCount<V>) {
+    write(e, bilinear(load<V>(pixel + e), load<V>(pixel + 4 + e), load<V>(below + e),
+                      load<V>(below + 4 + e), splat<V>(right), splat<V>(lower)));
   }
+}
+
+// Interpolates two points in a register of 256 bits. One load takes a pixel and its right
+// neighbour.
+template <typename T>
+inline Vector<T, 8> interpolate_two(const T* pixels, const T* below, const int32_t* offset,
+                                    const T* right, const T* lower) {
+  using V = Vector<T, 8>;
+  const auto pair = [&](int k) {
+    const V down = splat<V>(lower[k]);
+    return between(load<V>(pixels + offset[k]), load<V>(below + offset[k]), 1 - down, down);
+  };
+  const V first = pair(0), second = pair(1);
+  const auto both = (V)splat<Vector<double, 4>>(load_bits<double>(right));
+  const V along = __builtin_shufflevector(both, both, 0, 0, 0, 0, 5, 5, 5, 5);
+  return between(even_quads(first, second), odd_quads(first, second), 1 - along, along);
 }
 
 // Interpolates four points in a register of 512 bits. It first takes two pairs of pixels and the
@@ -53,25 +54,32 @@ inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int
   const V bottom = two_eights(below + offset[0], below + offset[1]);
   const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
   const V bottom2 = two_eights(below + offset[2], below + offset[3]);
-  const V pairs = between<true>(top, bottom, pick(down, first_two));
-  const V pairs2 = between<true>(top2, bottom2, pick(down, first_two + 2));
-  const V l = even_quads(pairs, pairs2), r = odd_quads(pairs, pairs2);
-  return between<true>(l, r, pick(along, all));
+  const auto mix = [](V a, V b, V t) { return between(a, b, 1 - t, t); };
+  const V pairs = mix(top, bottom, pick(down, first_two));
+  const V pairs2 = mix(top2, bottom2, pick(down, first_two + 2));
+  return mix(even_quads(pairs, pairs2), odd_quads(pairs, pairs2), pick(along, all));
 }
 
-// Returns whether all lanes are finite.
-template <typename V>
-inline bool all_finite(const V& v) {
-  bool finite = true;
-  for (int lane = 0; lane < kCount<V>; ++lane) finite &= v[lane] - v[lane] == 0;
-  return finite;
+// How samples are normalized: not at all, or as those of 8-bit pixels inside the image, or as those
+// of 8-bit pixels of which some may lie outside. The last of four channels is then the coverage.
+enum class Normalization { none, inside, border };
+
+template <Normalization how, typename V>
+inline V finished(V v, V scale, V offset) {
+  if constexpr (how == Normalization::none) {
+    return v;
+  } else if constexpr (how == Normalization::inside) {
+    return normalized(v, scale, offset);
+  } else {
+    return normalized(v, scale, offset, shuffle<[](int i) { return i | 3; }>(v, v));
+  }
 }
 
-// The output places of a block of points: point k goes to to[place[k]]. room[k] is the number of
-// values from there to the end of the row of a token, but at most kRoom.
+// The output of a block of points: point k goes to to[target[k]]. room[k] is the number of values
+// from there to the end of the row of a token, but at most kRoom.
 constexpr int64_t kRoom = 16;
 struct Targets {
-  int32_t place[kBlock], room[kBlock];
+  int32_t target[kBlock], room[kBlock];
 };
 
 // Samples `count` points of a packed image.
@@ -81,19 +89,25 @@ struct Targets {
 // thread may write there. So the last points of a token's last row, which begins at point
 // `last_row`, store only their own values.
 //
-// Returns false if it used differences and a sample is not finite. The sum of all samples shows
-// this. This is a separate function, so that all its values stay in registers.
-template <bool kWeights, typename T>
-[[gnu::noinline]] bool sample_points(const T* pixels, int64_t row, const PackedPlaces<T>& places,
-                                     int64_t last_row, int64_t count, const Targets& targets,
-                                     int64_t channels, T* to) {
+// This is a separate function, so that all its values stay in registers.
+template <Normalization how, typename T>
+[[gnu::noinline]] void sample_points(const PolarSampleArgs<T>& a, const T* pixels, int64_t row,
+                                     const PackedPlaces<T>& places, int64_t last_row, int64_t count,
+                                     const Targets& targets, T* to) {
   const T* below = pixels + row;
-  const int32_t *offset = places.offset, *target = targets.place, *room = targets.room;
+  const int64_t channels = a.channels;
+  const int32_t *offset = places.offset, *target = targets.target, *room = targets.room;
   const T *right = places.right, *lower = places.lower;
+  using V = Vector<T, 4>;
+  constexpr bool bytes = how != Normalization::none;
+  const V scale = bytes ? load<V>(a.pixel_scale) : V{};
+  const V shift = bytes ? load<V>(a.pixel_offset) : V{};
   int64_t k = 0;
   if constexpr (is_same_v<T, float> && kRegister == 64) {
+    const auto scales = repeat(scale), shifts = repeat(shift);
     for (; k + 4 <= count; k += 4) {
-      const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
+      const auto v = finished<how>(
+          interpolate_four(pixels, below, offset + k, right + k, lower + k), scales, shifts);
       if (room[k] >= 4 * channels) {
         store_quarters(to + target[k], v, channels);
       } else {
@@ -101,27 +115,37 @@ template <bool kWeights, typename T>
       }
     }
   }
-  Piece<T> sums[4]{};  // used in turn, so that no addition waits for the one before
-  const auto sample = [&](int64_t k, T* out, Piece<T>* sum) {
-    interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], out, sum);
+  const auto sample = [&](int64_t k, T* out) {
+    interpolate(pixels + offset[k], below + offset[k], right[k], lower[k], [&](int e, auto v) {
+      if constexpr (bytes) v = finished<how>(v, scale, shift);
+      store(out + e, v);
+    });
   };
+  if constexpr (is_same_v<T, float> && kRegister == 32) {
+    const auto scales = repeat(scale), shifts = repeat(shift);
+    for (; k + 2 <= last_row; k += 2) {
+      const auto v = finished<how>(interpolate_two(pixels, below, offset + k, right + k, lower + k),
+                                   scales, shifts);
+      store(to + target[k], lower_half(v));
+      store(to + target[k + 1], upper_half(v));
+    }
+  }
   for (; k + 4 <= last_row; k += 4) {
 #pragma GCC unroll 4
-    for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn], sums + turn);
+    for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn]);
   }
   for (; k < count; ++k) {
     if (k < last_row || (room[k] >= 4 && k + 4 <= count)) {
-      sample(k, to + target[k], sums);
+      sample(k, to + target[k]);
       continue;
     }
     T v[4];
-    sample(k, v, sums + 1);
+    sample(k, v);
 #pragma GCC unroll 4
     for (int c = 0; c < 4; ++c) {
       if (c < channels) to[target[k] + c] = v[c];
     }
   }
-  return kWeights || all_finite((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
 template <typename T>
@@ -151,7 +175,7 @@ class Sampler {
       for (int64_t sector = 0; sector * a.samples_a < columns; ++sector) {
         for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
           const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
-          state.targets.place[k] = static_cast<int32_t>(to);
+          state.targets.target[k] = static_cast<int32_t>(to);
           const int64_t room = smaller((a.samples_a - s) * a.channels, kRoom);
           state.targets.room[k] = static_cast<int32_t>(room);
         }
@@ -166,6 +190,10 @@ class Sampler {
         pack<T, E>(a, packed, b, image + packed.size + 16, image);
       });
       image_in_hand = b;
+    }
+    ring_inside = a.packed && a.pixel == Pixel::u8;  // not needed otherwise
+    for (int64_t n = 0; n < a.samples_r && ring_inside; ++n) {
+      ring_inside = points.inside(a, b, ring * a.samples_r + n);
     }
     const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.samples_r);
     for (int64_t j = 0, count; j < a.num_azimuths; j += count) {
@@ -187,7 +215,7 @@ class Sampler {
     T samples[4 * kBlock];
   };
 
-  // Returns whether polar_bytes.h samples the far image.
+  // Returns whether polar_bytes.h samples the image.
   static bool reads_bytes(const PolarSampleArgs<T>& a) {
     const double last =
         (static_cast<double>(a.height) - 1) * static_cast<double>(a.image_stride[2]) +
@@ -220,19 +248,20 @@ class Sampler {
     T* out = to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
     if (!a.packed) {
       for (int64_t n = 0; n < rows; ++n) {
-        points.template find_far<false>(a, a.image_stride + 2, b, first + n, j, count, n * count);
+        points.template find_direct<false>(a, a.image_stride + 2, b, first + n, j, count,
+                                           n * count);
       }
       if (reads_bytes(a)) {
         sample_bytes(b, rows * count);
         return spread(rows, count, out);
       }
-      with_pixel_type<T>(a.pixel, [&]<typename E>() { far_lines<E>(b, j, rows, count, out); });
+      with_pixel_type<T>(a.pixel, [&]<typename E>() { direct_lines<E>(b, j, rows, count, out); });
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
-      points.find(a, packed, b, first + n, j, count, n * count);
+      points.find_packed(a, packed, b, first + n, j, count, n * count);
       if (row_stride == a.samples_a * a.channels && rows == a.samples_r) {
-        // The tokens of the next block follow these in memory, so this prefetches their place.
+        // The tokens of the next block follow these in memory, so this prefetches their memory.
         const char* next =
             reinterpret_cast<const char*>(to + (j + count) / a.samples_a * sector_stride);
         const int64_t bytes = count * row_stride / a.samples_a * sizeof(T);
@@ -246,35 +275,41 @@ class Sampler {
       // memory is written later, except behind the last three points of the block.
       const bool last = row + rows == a.samples_r && a.samples_r > 1;
       const int64_t all = rows * count, last_row = last ? all - count : all - 3;
-      const auto sample = [&]<bool kWeights>() {
-        return sample_points<kWeights>(image, packed.row, points.near, last_row, all, state.targets,
-                                       a.channels, out);
+      const auto sample = [&]<Normalization how>() {
+        sample_points<how>(a, image, packed.row, points.packed, last_row, all, state.targets, out);
       };
-      if constexpr (kTryDifferences<T>) {
-        if (sample.template operator()<false>()) return;
+      using enum Normalization;
+      if (a.pixel != Pixel::u8) return sample.template operator()<none>();
+      if constexpr (is_same_v<T, float>) {
+        return ring_inside ? sample.template operator()<inside>()
+                           : sample.template operator()<border>();
       }
-      sample.template operator()<true>();
-      return;
     }
     for (int64_t n = 0; n < rows; ++n) {
-      near_row(j, count, n * count, to + (row + n) * row_stride);
+      packed_row(j, count, n * count, to + (row + n) * row_stride);
     }
   }
 
-  // Samples points j to j + count of a radius, with any number of channels, starting at place
-  // `place`.
-  void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
+  // Samples points j to j + count of a radius, with any number of channels. Their places begin at
+  // index `first`.
+  void packed_row(int64_t j, int64_t count, int64_t first, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
       T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;
-      const T* pixel = image + points.near.offset[place + k];
-      const T right = points.near.right[place + k], lower = points.near.lower[place + k];
+      const T* pixel = image + points.packed.offset[first + k];
+      const T right = points.packed.right[first + k], lower = points.packed.lower[first + k];
       const T *below = pixel + packed.row, *next = pixel + packed.pixel,
               *opposite = below + packed.pixel;
+      const auto channel = [&](int64_t c) {
+        return bilinear(pixel[c], next[c], below[c], opposite[c], right, lower);
+      };
 #pragma omp simd
-      for (int64_t c = 0; c < a.channels; ++c) {
-        const T l = between(pixel[c], below[c], 1 - lower, lower);
-        const T r = between(next[c], opposite[c], 1 - lower, lower);
-        to[c] = between(l, r, 1 - right, right);
+      for (int64_t c = 0; c < a.channels; ++c) to[c] = channel(c);
+      if constexpr (is_same_v<T, float>) {
+        if (a.pixel != Pixel::u8) continue;
+        const T coverage = channel(3);
+        for (int64_t c = 0; c < a.channels; ++c) {
+          to[c] = normalized(to[c], a.pixel_scale[c], a.pixel_offset[c], coverage);
+        }
       }
     }
   }
@@ -292,7 +327,7 @@ class Sampler {
                             stride[1],
                             a.pixel_scale,
                             a.pixel_offset};
-      const FarPlaces<T>& at = points.far;
+      const DirectPlaces<T>& at = points.direct;
       for (int64_t k = 0; k < count; k += kByteBlock) {
         const int64_t part = smaller(kByteBlock, count - k);
         T* to = state.samples + k * a.channels;
@@ -301,20 +336,19 @@ class Sampler {
             const int64_t offset = at.offset[k + e];
             state.bytes.offset[e] = offset < 0 ? 0 : static_cast<int32_t>(offset);
           }
-          state.bytes.template sample<Blend::far>(bytes, at.right + k, at.lower + k, part);
+          state.bytes.sample(bytes, at.right + k, at.lower + k, part);
           state.bytes.write(a.channels, part, to);
         }
         for (int64_t e = k; e < k + part; ++e, to += a.channels) {
           for (int64_t c = 0; c < a.channels && at.offset[e] < 0; ++c) {
-            to[c] = border_sample<Blend::far>(bytes, at.column[e], at.row[e], at.right[e],
-                                              at.lower[e], c);
+            to[c] = border_sample(bytes, at.column[e], at.row[e], at.right[e], at.lower[e], c);
           }
         }
       }
     }
   }
 
-  // Copies the samples of a block, `rows` times `count` points, to their places in the output.
+  // Copies the samples of a block, `rows` times `count` points, to the output.
   void spread(int64_t rows, int64_t count, T* to) const {
     const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
     const T* from = state.samples;
@@ -326,26 +360,27 @@ class Sampler {
     }
   }
 
-  // Samples a block in the far image. The values behind a line of samples may be overwritten if the
+  // Samples a block directly. The values behind a line of samples may be overwritten if the
   // token has more samples there, which come later. This holds for all lines except those that end
   // a row of the token.
   template <typename E>
-  [[gnu::noinline]] void far_lines(int64_t b, int64_t j, int64_t rows, int64_t count, T* to) const {
-    const FarImage<T, E> far(a, b, points.far);
+  [[gnu::noinline]] void direct_lines(int64_t b, int64_t j, int64_t rows, int64_t count,
+                                      T* to) const {
+    const DirectImage<T, E> pixels(a, b, points.direct);
     if (a.gathers) {
-      far.block(rows * count, state.samples);
+      pixels.block(rows * count, state.samples);
       return spread(rows, count, to);
     }
     const bool joined = rows == 1 && sector_stride == a.samples_a * a.channels;
-    const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, far.planes() > 1);
-    const auto fetch = [&](const Line& line) { far.fetch(line); };
+    const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, pixels.planes() > 1);
+    const auto fetch = [&](const Line& line) { pixels.fetch(line); };
     const int64_t width = smaller(a.samples_a, count);
     visit_lines(lines, fetch, [&](const Line& line) {
       T* out = to + line.token * sector_stride + line.sample * a.channels + line.row * row_stride;
       if (line.flat) {
-        far.sample(line, {out, a.channels, false});
+        pixels.sample(line, {out, a.channels, false});
       } else {
-        far.sample(line, {out, row_stride, line.sample + 1 < width});
+        pixels.sample(line, {out, row_stride, line.sample + 1 < width});
       }
     });
   }
@@ -358,6 +393,7 @@ class Sampler {
   PlacedPoints<T>& points;
   T* image;  // packed image, then the rows that pack() converts
   int64_t image_in_hand = -1;
+  bool ring_inside = false;  // all pixels around the points of the ring in hand are in the image
 };
 
 }  // namespace

@@ -8,7 +8,7 @@
 // image the gradient itself holds the sums.
 //
 // Neighbouring points often add to the same pixel, and an addition must wait for the one before. So
-// the points are taken from several places of the circle in turn.
+// the points are taken from several arcs of the circle in turn.
 #pragma once
 
 #include "polar_rows.h"
@@ -39,7 +39,7 @@ class Scatter {
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
         sums(grads + args.samples_r * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
-    if (keep == kInPlace) {
+    if (keep == kDirect) {
       T* rows =
           static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
       for (int64_t c = 0; c < a.channels; ++c, rows += a.height * a.width) {
@@ -50,18 +50,17 @@ class Scatter {
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
-  // Adds the gradients of a ring. read(n, to) writes the gradients of its radius n as
-  // (num_azimuths, C).
-  template <typename Read>
-  void ring(int64_t ring, Read read) {
+  // Adds the gradients of a ring.
+  void ring(int64_t ring) {
     const int64_t first = ring * a.samples_r;
-    if (keep == kInPlace) {
+    const auto read = [&](int64_t n, T* to) { read_row(a, output_row(a, image, first + n), to); };
+    if (keep == kDirect) {
       bool any = false;
       for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
       if (!any) return;
       const int64_t line_size = row_bytes(a) / sizeof(T);
       for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line_size);
-      add_in_place(first, line_size);
+      add_direct(first, line_size);
       return;
     }
     for (int64_t n = 0; n < a.samples_r; ++n) {
@@ -69,7 +68,7 @@ class Scatter {
       read(n, grads);
       for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
         const int64_t count = smaller(kBlock, a.num_azimuths - j);
-        points.find(a, layout, image, first + n, j, count, 0);
+        points.find_packed(a, layout, image, first + n, j, count, 0);
         if (keep == kCells) {
           add_to_cells(count, grads + j * a.channels);
         } else {
@@ -81,7 +80,7 @@ class Scatter {
 
   // Writes the sums to the gradient of the image.
   void finish() const {
-    if (keep == kInPlace) return;
+    if (keep == kDirect) return;
     with_pixel_type<T>(a.pixel, [&]<typename E>() {
       if constexpr (sizeof(E) > 1) {
         E* to = static_cast<E*>(a.grad_image) + image * a.channels * a.height * a.width;
@@ -97,18 +96,18 @@ class Scatter {
   }
 
  private:
-  enum Keeping { kCells, kPacked, kInPlace };
+  enum Keeping { kCells, kPacked, kDirect };
 
-  // bfloat16 gradients are never added in place, because their sums are float32.
+  // bfloat16 gradients never hold the sums, because these are float32.
   static Keeping keeping(const PolarSampleArgs<T>& a) {
-    if (!a.packed && a.pixel != Pixel::bf16) return kInPlace;
+    if (!a.packed && a.pixel != Pixel::bf16) return kDirect;
     const bool cells =
         sizeof(T) == sizeof(float) && a.channels <= 4 && Packed(a).size * 16 <= kCellBytes;
     return cells ? kCells : kPacked;
   }
 
   static Packed sums_layout(const PolarSampleArgs<T>& a) {
-    return keeping(a) == kInPlace ? Packed() : Packed(a, keeping(a) == kCells ? 4 : 1);
+    return keeping(a) == kDirect ? Packed() : Packed(a, keeping(a) == kCells ? 4 : 1);
   }
 
   // The band keeps the sums of its rows of pixels. The outermost bands also keep the border. Cells
@@ -117,22 +116,22 @@ class Scatter {
   int64_t first_kept() const { return first_row == 0 ? 0 : first_row + (keep == kCells ? 0 : 1); }
   int64_t end_kept() const { return end_row == a.height ? a.height + 3 : end_row + 1; }
 
-  // Calls visit(k) for all k < count, taking several places in turn.
+  // Calls visit(k) for all k < count, taking several arcs in turn.
   template <typename Visit>
   static void in_turn(int64_t count, Visit visit) {
-    constexpr int64_t places = 8;
-    const int64_t each = count / places;
+    constexpr int64_t arcs = 8;
+    const int64_t each = count / arcs;
     for (int64_t k = 0; k < each; ++k) {
 #pragma GCC unroll 8
-      for (int64_t p = 0; p < places; ++p) visit(p * each + k);
+      for (int64_t p = 0; p < arcs; ++p) visit(p * each + k);
     }
-    for (int64_t k = each * places; k < count; ++k) visit(k);
+    for (int64_t k = each * arcs; k < count; ++k) visit(k);
   }
 
   // A cell holds (upper left, upper right, lower left, lower right), with four channels each.
   [[gnu::noinline]] void add_to_cells(int64_t count, const T* block) const {
     const int64_t channels = a.channels;
-    const PackedPlaces<T>& places = points.near;
+    const PackedPlaces<T>& places = points.packed;
     T* cells = sums;
     const int64_t begin = first_kept() * layout.row, end = end_kept() * layout.row;
     const bool banded = a.bands > 1;
@@ -202,9 +201,9 @@ class Scatter {
   template <bool kBanded>
   void add_pixels(int64_t k, const T* block) const {
     using V = Piece<T>;
-    const V down = splat<V>(points.near.lower[k]), right = splat<V>(points.near.right[k]);
+    const V down = splat<V>(points.packed.lower[k]), right = splat<V>(points.packed.right[k]);
     const V up = 1 - down, left = 1 - right;
-    const int64_t offset = points.near.offset[k], pixel = layout.pixel;
+    const int64_t offset = points.packed.offset[k], pixel = layout.pixel;
     const bool upper = !kBanded || in_band(offset);
     const bool lower = !kBanded || in_band(offset + layout.row);
     T* top = sums + offset;
@@ -223,13 +222,13 @@ class Scatter {
     }
   }
 
-  // Returns whether a place in the packed image is in a row of the band.
+  // Returns whether a pixel of the packed image is in a row of the band.
   bool in_band(int64_t offset) const {
     return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
   }
 
   // Takes the same blocks of points as Sampler.
-  void add_in_place(int64_t first, int64_t line_size) {
+  void add_direct(int64_t first, int64_t line_size) {
     const int64_t strides[2] = {a.width, 1};
     const int64_t token = a.samples_r * a.samples_a;
     const int64_t columns =
@@ -240,34 +239,35 @@ class Scatter {
       for (int64_t row = 0; row < a.samples_r; row += rows) {
         const int64_t end = smaller(row + rows, a.samples_r);
         for (int64_t n = row; n < end; ++n) {
-          points.template find_far<true>(a, strides, image, first + n, j, count, (n - row) * count);
+          points.template find_direct<true>(a, strides, image, first + n, j, count,
+                                            (n - row) * count);
         }
         const auto add = [&](const Line& line) {
           const int64_t step = line.flat ? a.channels : line_size;
           const int64_t column = j + line.token * a.samples_a + line.sample;
           const T* from = grads + (row + line.row) * line_size + column * a.channels;
           for (int64_t k = 0; k < line.count; ++k) {
-            add_point(line.place + k * line.step, from + k * step);
+            add_point(line.first + k * line.step, from + k * step);
           }
         };
         const auto fetch = [&](const Line& line) {
           const int64_t plane = a.height * a.width;
           const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
-          fetch_pixels(points.far, line, pixels, a.channels, plane, a.width);
+          fetch_pixels(points.direct, line, pixels, a.channels, plane, a.width);
         };
         visit_lines(Lines<T>(a, j, end - row, count, a.samples_a, true), fetch, add);
       }
     }
   }
 
-  void add_point(int64_t place, const T* grad) const {
-    const int64_t column = points.far.column[place], row = points.far.row[place];
+  void add_point(int64_t k, const T* grad) const {
+    const int64_t column = points.direct.column[k], row = points.direct.row[k];
     const bool upper = row >= first_row && row < end_row;
     const bool lower = row + 1 >= first_row && row + 1 < end_row;
     if (!upper && !lower) return;
     const bool left = column >= 0 && column < a.width;
     const bool next = column >= -1 && column + 1 < a.width;
-    const T by_down = points.far.lower[place], by_right = points.far.right[place];
+    const T by_down = points.direct.lower[k], by_right = points.direct.right[k];
     const T by_up = 1 - by_down, by_left = 1 - by_right;
     const T up_left = by_up * by_left, up_right = by_up * by_right;
     const T down_left = by_down * by_left, down_right = by_down * by_right;

@@ -63,7 +63,7 @@ class Sampler {
  public:
   Sampler(const Array<int16_t>& columns, const Array<int16_t>& rows, const Array<float>& right,
           const Array<float>& lower, std::pair<int64_t, int64_t> size, std::vector<float> scale,
-          std::vector<float> offset, bool normalize_first, const std::string& output)
+          std::vector<float> offset, const std::string& output)
       : shape(columns.shape(), columns.shape() + columns.ndim()),
         columns(padded(columns)),
         rows(padded(rows)),
@@ -72,8 +72,7 @@ class Sampler {
         height(size.first),
         width(size.second),
         scale(std::move(scale)),
-        offset(std::move(offset)),
-        normalize_first(normalize_first) {
+        offset(std::move(offset)) {
     const int64_t points = columns.size();
     const bool tokens = output == "tokens",
                known = tokens || output == "image" || output == "uint8";
@@ -136,8 +135,8 @@ class Sampler {
         INT32_MAX) {
       throw py::value_error("frame must span less than 2 GB of memory");
     }
-    float factors[3], shifts[3];
-    for (int c = 0; c < 3; ++c) {
+    float factors[3] = {1, 1, 1}, shifts[3] = {};  // bytes are not normalized
+    for (int c = 0; c < 3 && kind != FrameOutput::bytes; ++c) {
       factors[c] = scale[scale.size() > 1 ? c : 0], shifts[c] = offset[scale.size() > 1 ? c : 0];
     }
     image.scale = factors, image.offset = shifts;
@@ -146,11 +145,6 @@ class Sampler {
     a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
     a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
     a.output = kind;
-    // See Sampler::block in kernels/polar_sampler.h.
-    a.blend = kind == FrameOutput::bytes           ? Blend::raw
-              : !normalize_first                   ? Blend::far
-              : shape.back() * image.channels >= 4 ? Blend::near_rows
-                                                   : Blend::near;
     py::array result = output_array(out, output_shape(image.channels, colors));
     if (!out.is_none() && share_memory(frame, result)) {
       throw py::value_error("out must not share memory with the frame");
@@ -210,13 +204,11 @@ class Sampler {
   const std::vector<float> right, lower;
   const int64_t height, width;
   const std::vector<float> scale, offset;
-  const bool normalize_first;
   FrameOutput kind;
   std::vector<BorderPoint> border;
 };
 
-// Places the points of one polar grid among the pixels of images of one size. The last result tells
-// whether the operator would pack such an image, and so normalize its pixels first.
+// Finds the places of the points of one polar grid among the pixels of images of one size.
 py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
                        const Array<float>& center, const std::optional<Array<float>>& affine,
                        const std::optional<Array<float>>& offsets,
@@ -239,10 +231,7 @@ py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
   py::array_t<float> right({count, around}), lower({count, around});
   kernels<FrameKernels>().places(a, angles.data(), padded, columns.mutable_data(),
                                  rows.mutable_data(), right.mutable_data(), lower.mutable_data());
-  const double bytes = packed_values(a.height, a.width, 3) * sizeof(float);
-  const bool packed = worth_packing(bytes, static_cast<double>(a.height * a.width),
-                                    static_cast<double>(count * around));
-  return py::make_tuple(columns, rows, right, lower, packed);
+  return py::make_tuple(columns, rows, right, lower);
 }
 
 }  // namespace
@@ -255,10 +244,9 @@ PYBIND11_MODULE(_frames, m) {
   m.def("sampler", [](const Array<int16_t>& columns, const Array<int16_t>& rows,
                       const Array<float>& right, const Array<float>& lower,
                       std::pair<int64_t, int64_t> size, std::vector<float> scale,
-                      std::vector<float> offset, bool normalize_first, const std::string& output) {
-    const auto sampler =
-        std::make_shared<const Sampler>(columns, rows, right, lower, size, std::move(scale),
-                                        std::move(offset), normalize_first, output);
+                      std::vector<float> offset, const std::string& output) {
+    const auto sampler = std::make_shared<const Sampler>(
+        columns, rows, right, lower, size, std::move(scale), std::move(offset), output);
     return py::cpp_function([sampler](const py::object& frame, const py::object& out,
                                       int64_t threads) { return (*sampler)(frame, out, threads); },
                             py::name("sample"), py::arg("frame"), py::arg("out") = py::none(),

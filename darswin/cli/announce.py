@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.utilities import rank_zero_only
 
 from darswin.train.runs import BestCheckpoint
-from darswin.train.task import Task
+from darswin.train.task import TaskModule
 
 # Fewer steps do not teach a new model anything: AdamW moves a weight by about the learning rate in
 # each, so weights of about 0.02 need some tens of steps of 1e-3, and the cosine shrinks the last.
@@ -27,7 +27,7 @@ class Announce(Callback):
     """Says how large a training is once it begins, and warns if its schedule has too few steps."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, Task)
+        assert isinstance(pl_module, TaskModule)
         if not trainer.is_global_zero:
             return  # only the first process has checked the files
         parameters = sum(p.numel() for p in pl_module.net.parameters())
@@ -54,7 +54,7 @@ class EpochLines(Callback):
         say(f"epoch {trainer.current_epoch + 1}, step {trainer.global_step}: {shown}")
 
 
-def shortfalls(task: Task) -> list[str]:
+def shortfalls(task: TaskModule) -> list[str]:
     """What is wrong with the number of steps: fewer than `FEW_STEPS`, or half of them warm-up."""
     steps, found = task.steps, []
     if steps < FEW_STEPS:

@@ -15,8 +15,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from darswin.data.reframing import at_size
 from darswin.data.scenes.targets import IGNORE, PER_METRE
-from darswin.data.warping import CutOff, Framing, FullSize, at_size, cut_off, picture_size
+from darswin.data.warping import CutOff, FullSize, cut_off, picture_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -24,6 +25,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.saving import ModelCard
 from darswin.utils.files import replace_file
+from darswin.utils.tasks import Fit
 from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
@@ -258,7 +260,7 @@ def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
-def framing_of(net: Model, card: ModelCard) -> Framing:
+def framing_of(net: Model, card: ModelCard) -> Fit:
     """The framing of the model's training; models that take only squares crop."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit
 

@@ -8,13 +8,13 @@ from typing import Any
 
 from darswin.cli.options import FIRST_TASK, content_of
 from darswin.data.cameras import Calibrations, is_json
-from darswin.data.scenes import Scenes, Target, open_scenes
+from darswin.data.scenes import Scenes, open_scenes
+from darswin.data.scenes.targets import TARGETS, Target
 from darswin.data.splits import some
 
 # The lenses of files, by the files' names.
 Lenses = Mapping[str, Calibrations]
 
-_TARGETS: dict[str, Target] = {"segmentation": "labels", "distance": "distance"}
 _OPENING = ("classes", "splits", "label_map", "holdout")
 
 
@@ -55,7 +55,7 @@ def lenses_of_run(
     camera = camera or data.get("camera")
     coefficients = coefficients or data.get("coefficients")
     lens, path = data.get("lens"), data.get("path", ".")
-    if lens is None and task not in _TARGETS:
+    if lens is None and task not in TARGETS:
         raise ValueError(f"{missing}, because {run} was trained on pictures without a lens")
     try:
         if lens is not None:
@@ -63,7 +63,7 @@ def lenses_of_run(
         else:
             opening = {"camera": camera, "coefficients": coefficients}
             opening |= {option: data[option] for option in _OPENING if option in data}
-            found = _of_scenes(_scenes(path, _TARGETS[task], opening), files)
+            found = _of_scenes(_scenes(path, TARGETS[task], opening), files)
         for file in files:
             found[file].camera_of(file)
     except (ValueError, OSError) as error:

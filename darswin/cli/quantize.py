@@ -105,7 +105,7 @@ def _comparison(
             same += int((before == after).sum())
     share = f"mean square change / variance: {results.share():.1e}"
     yield f"{pictures} validation pictures: {share}"
-    if task != "distance":
+    if task in ("classification", "segmentation"):
         yield (
             f"correct: {_percent(right, known)} before, {_percent(kept, known)} after; same "
             f"prediction: {_percent(same, pixels)}"

@@ -12,21 +12,14 @@ from torch.utils.data import Dataset
 from darswin.data.cameras import Calibrations
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
-from darswin.data.reframing import warp_picture
+from darswin.data.reframing import STILL, Moved, RandomTurns, Reframing, Turn, Warped, reframe
+from darswin.data.sample import Sample
 from darswin.data.scenes.scene import Scenes
-from darswin.data.warping import (
-    Crop,
-    Framing,
-    RandomTurns,
-    Turn,
-    at_size,
-    cut_off,
-    lens_at_size,
-    picture_size,
-    turned_picture,
-)
+from darswin.data.warping import Crop, Part, cut_off, picture_size, taken_part
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, Header, read_header
+from darswin.utils.parameters import check
+from darswin.utils.tasks import Fit
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -47,14 +40,16 @@ class Draw(NamedTuple):
 
 
 class Samples(Dataset):
-    """Base of the data sets, see `Calibrated`; subclasses define `_seen` and `_lens_alone`."""
+    """Base of the data sets, see `Calibrated`; subclasses define `_read` and `_lens_alone`."""
+
+    _other = 1  # the purpose of the random numbers of `_other_lens`
 
     def __init__(
         self,
         source: Source | Scenes,
         *,
         size: int = 64,
-        framing: Framing = "stretch",
+        fit: Fit = "stretch",
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
         turns: RandomTurns | None = None,
@@ -64,9 +59,8 @@ class Samples(Dataset):
         seed: int = 0,
         skip_broken: bool = False,
     ):
-        if framing not in ("crop", "stretch"):
-            raise ValueError(f"framing must be 'crop' or 'stretch', got {framing!r}")
-        self.source, self.size, self.framing = source, size, framing
+        check("fit", repr(fit), fit in ("crop", "stretch"), "'crop' or 'stretch'")
+        self.source, self.size, self.fit = source, size, fit
         self.mean = np.asarray(mean, np.float32)[:, None, None]
         self.std = np.asarray(std, np.float32)[:, None, None]
         self.turns, self.lens_augmentation = turns, lens_augmentation
@@ -87,11 +81,11 @@ class Samples(Dataset):
         return self._broken.nonzero().flatten().tolist()
 
     def cut_off(self) -> str | None:
-        """What the framing cuts off the pictures, in words; None if nothing is lost.
+        """What `fit` cuts off the pictures, in words; None if nothing is lost.
 
         It looks at 32 pictures or a few more, and describes the first that loses something.
         """
-        if self.framing != "crop":
+        if self.fit != "crop":
             return None
         for index in range(0, len(self), max(1, len(self) // _LOOKED_AT)):
             try:
@@ -102,24 +96,26 @@ class Samples(Dataset):
                 return lost
         return None
 
-    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor]:
+    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor | None]:
         if not isinstance(draw, Draw):
             draw = Draw(0, int(draw), int(draw))
         try:
-            image, lens, label = self._seen(draw)
+            image, target, lens = self.shown(draw)
         except BrokenImageError:
             if not self.skip_broken:
                 raise
             self._broken[draw.picture] = True
             black = torch.from_numpy(-self.mean / self.std)
             black = black.expand(-1, self.size, self.size).clone()
-            return black, self._lens_alone(draw), self._unknown()
+            return black, self._reframing(self._lens_alone(draw), draw).lens, self._unknown()
         rng = self._random(draw.epoch, draw.picture, 0)
         if self.augment:
             image = self.augment(image, rng)
-        image = (image.transpose(2, 0, 1) * np.float32(1 / 255) - self.mean) / self.std
+        image = np.ascontiguousarray(image.transpose(2, 0, 1)) * np.float32(1 / 255)
+        image = (image - self.mean) / self.std
         if self.erase:
             image = self.erase(image, rng)
+        label = as_tensor(target) if isinstance(target, np.ndarray) else target
         return torch.from_numpy(np.ascontiguousarray(image)), lens, label
 
     def headers(self, index: int) -> Sequence[Header]:
@@ -131,7 +127,7 @@ class Samples(Dataset):
         """Raises what `self[index]` would raise, as far as its headers tell; for None, the files
         are read. `skip_broken` has no effect."""
         if headers is None:
-            self._seen(Draw(0, index, index))
+            self.shown(Draw(0, index, index))
         elif headers:
             self._check(index, headers)
 
@@ -141,30 +137,52 @@ class Samples(Dataset):
     def _random(self, epoch: int, key: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, epoch, key, purpose))
 
-    def _turn(self, draw: Draw) -> Turn | None:
-        return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else None
+    def shown(self, draw: Draw) -> Sample:
+        """The sample at the size, before its colours are changed, with an image (H, W, C) uint8."""
+        sample = self._read(draw)
+        return reframe(sample, self._reframing(sample.lens, draw))
 
-    def _other_lens(
-        self, draw: Draw, own: Lens, crop: Crop | None = None, purpose: int = 1
-    ) -> Lens:
+    def _reframing(self, own: Lens, draw: Draw) -> Reframing:
+        """The way to show a picture of the lens `own`."""
+        turn, crop = self._turn(draw), self._crop(draw)
+        if self.lens_augmentation is not None:
+            return Warped(own, self._other_lens(draw, own, crop), turn)
+        part = taken_part(picture_size(own), self.fit, crop)
+        return Moved(own, part, (self.size, self.size), turn, self._render(part))
+
+    def _turn(self, draw: Draw) -> Turn:
+        return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else STILL
+
+    def _crop(self, draw: Draw) -> Crop | None:
+        """A random part of the pictures."""
+        return None
+
+    def _render(self, part: Part) -> tuple[int, int] | None:
+        """`Reframing`'s number of points for a part of a turned picture."""
+        return None
+
+    def _other_lens(self, draw: Draw, own: Lens, crop: Crop | None = None) -> Lens:
         """A random lens of `lens_augmentation` for a picture of the lens `own`, or for a part."""
         lenses = self.lens_augmentation
         assert lenses is not None
-        size, share = self.size, 1.0 if crop is None else crop.share
-        radius, theta_max = size / share / 2, own.theta_max.item()
+        limit = _USED * self._drawn(lenses, draw, self._other, 1.0, crop).theta_limit.item()
+        fov = 2 * min(own.theta_max.item(), limit)
+        return self._drawn(lenses, draw, self._other, fov, crop)
 
-        def of_fov(fov: float) -> Lens:
-            return lenses.draw(self._random(draw.epoch, draw.lens, purpose), fov, radius)
-
-        limit = _USED * of_fov(1.0).theta_limit.item()
-        lens = of_fov(2 * min(theta_max, limit))
-        middle, left = (size / share - 1) / 2, size / share - size
-        across, down = (0.0, 0.0) if crop is None else (crop.across, crop.down)
+    def _drawn(
+        self, lenses: LensDistribution, draw: Draw, purpose: int, fov: float, crop: Crop | None
+    ) -> Lens:
+        """A random lens whose circle touches the sides of the image, or of a larger image of which
+        `crop` is the part that is shown."""
+        share, across, down = crop or (1.0, 0.0, 0.0)
+        whole = self.size / share
+        lens = lenses.draw(self._random(draw.epoch, draw.lens, purpose), fov, whole / 2)
+        middle, left = (whole - 1) / 2, whole - self.size
         center = lens.theta_max.new_tensor([[middle - across * left, middle - down * left]])
-        return lens.replace(center=center, image_size=center.new_tensor([[size, size]]))
+        return lens.replace(center=center, image_size=center.new_tensor([[self.size] * 2]))
 
-    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int | Tensor]:
-        """The image (size, size, C) uint8 before augmentation, its lens and its label."""
+    def _read(self, draw: Draw) -> Sample:
+        """The sample as it was taken."""
         raise NotImplementedError
 
     def _lens_alone(self, draw: Draw) -> Lens:
@@ -173,11 +191,18 @@ class Samples(Dataset):
 
     def _taken(self, index: int) -> tuple[tuple[int, int], Lens | None]:
         """(H, W) of a picture, and the lens that took it, if it is known."""
-        raise NotImplementedError
+        lens = self._read(Draw(0, index, index)).lens
+        return picture_size(lens), lens
 
     def _unknown(self) -> int | Tensor:
         """The label of a picture that cannot be read."""
         return -1
+
+
+def as_tensor(target: np.ndarray) -> Tensor:
+    """A target of pixels as a tensor: ids of labels as int64."""
+    tensor = torch.from_numpy(target)
+    return tensor if tensor.is_floating_point() else tensor.long()
 
 
 class Calibrated(Samples):
@@ -190,13 +215,13 @@ class Calibrated(Samples):
     Args:
         source: the pictures. calibrations: their lenses.
         size: px, H = W of the images.
-        framing: turns a picture into a square: "stretch" squashes it and keeps all that the lens
+        fit: turns a picture into a square: "stretch" squashes it and keeps all that the lens
             sees, "crop" cuts its longer side. The lens follows exactly.
         mean, std: per channel, in [0, 1]; the image is (pixel/255 - mean) / std.
         turns: random turns of the images with their lenses; None turns nothing.
         lens_augmentation: a distribution of lenses. Each picture is shown as a random lens would
             have seen it. The lens has the same θ_max, if it can, and its circle touches the sides
-            of the image. `framing` then has no effect on calibrated pictures.
+            of the image. `fit` then has no effect on calibrated pictures.
         augment: a function that changes the (H, W, C) uint8 image; its arguments are the image and
             a random generator.
         erase: the same for the normalised (C, H, W) float32 image.
@@ -219,32 +244,17 @@ class Calibrated(Samples):
         self.calibrations = calibrations
         self.cameras = calibrations.cameras_of([source.file(k) for k in range(len(source))])
 
-    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
-        picture, lens, label = self._with_lens(draw.picture)
-        turn = self._turn(draw)
-        if self.lens_augmentation is not None:
-            other = self._other_lens(draw, lens)
-            return warp_picture(picture, lens, other, self.size, turn), other, label
-        if turn is not None:
-            picture, lens = turned_picture(picture, lens, turn)
-        image, lens = at_size(picture, lens, self.size, self.framing)
-        return image, lens, label
-
-    def _with_lens(self, index: int) -> tuple[np.ndarray, Lens, int]:
-        picture, label, orientation = self.source.oriented(index)
-        size = picture.shape[0], picture.shape[1]
-        return picture, self.calibrations.lens_of(self.source.file(index), size, orientation), label
-
-    def _taken(self, index: int) -> tuple[tuple[int, int], Lens]:
-        lens = self._with_lens(index)[1]
-        return picture_size(lens), lens
+    def _read(self, draw: Draw) -> Sample:
+        picture, label, orientation = self.source.oriented(draw.picture)
+        file, size = self.source.file(draw.picture), (picture.shape[0], picture.shape[1])
+        return Sample(picture, label, self.calibrations.lens_of(file, size, orientation))
 
     def _check(self, index: int, headers: Sequence[Header]) -> None:
         (picture,) = headers
         self.calibrations.check(self.source.file(index), picture.upright, picture.orientation)
 
+    def _render(self, part: Part) -> tuple[int, int]:
+        return part[2:]  # a point for each pixel
+
     def _lens_alone(self, draw: Draw) -> Lens:
-        lens = self.calibrations.lens_alone(self.source.file(draw.picture))
-        if self.lens_augmentation is not None:
-            return self._other_lens(draw, lens)
-        return lens_at_size(lens, self.size, self.framing)
+        return self.calibrations.lens_alone(self.source.file(draw.picture))

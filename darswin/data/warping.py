@@ -1,8 +1,7 @@
-"""Warps, rotates and resizes pictures together with their lenses."""
+"""The sizes of pictures: through another lens, at a model's size, and back."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -10,17 +9,9 @@ import torch
 
 from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
-from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import pixel_angles, reprojection
 from darswin.utils.parameters import check
-
-# Ways to give a picture the size of a model: "crop" cuts the longer side, "stretch" squashes it,
-# "whole" keeps the aspect ratio and resizes the shorter side.
-Framing = Literal["crop", "stretch", "whole"]
-_MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
-
-
-# -- through another lens ---------------------------------------------------------------------
+from darswin.utils.tasks import Fit
 
 
 def warp_map(
@@ -36,126 +27,11 @@ def warp_map(
 
 
 def remap(
-    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR, border: float = 0
+    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR
 ) -> np.ndarray:
-    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside it."""
+    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; 0 outside it."""
     # With x and y in one array the second map is None, which OpenCV's types do not allow.
-    return cv2.remap(image, places, None, interpolation, borderValue=border)  # type: ignore[call-overload]
-
-
-def warp(
-    image: np.ndarray,
-    source: Lens,
-    target: Lens,
-    size: tuple[int, int],
-    *,
-    interpolation: int = cv2.INTER_LINEAR,
-) -> np.ndarray:
-    """The image of `source` as `target` would have seen it; black beyond either lens's θ_max.
-
-    Args:
-        image: (H, W) or (H, W, C), uint8 or float32, taken with `source`.
-        source, target: one lens each. size: (H, W) of the result.
-        interpolation: a constant of `cv2.remap`.
-
-    Raises:
-        ValueError: more than one lens; use `warp_map` for many.
-    """
-    if len(source) != 1 or len(target) != 1:
-        raise ValueError(f"warp takes one lens each, got {len(source)} and {len(target)}")
-    height, width = image.shape[:2]
-    return remap(image, warp_map(source, (height, width), target, size)[0], interpolation)
-
-
-# -- turned about the optical axis ------------------------------------------------------------
-
-
-class Turn(NamedTuple):
-    """A rotation by `angle` (rad, from x to y, so clockwise on a screen), then a swap of left and
-    right if `mirrored`."""
-
-    angle: float
-    mirrored: bool
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """The matrix (2, 2) for points relative to the principal point of a lens without affine."""
-        cos, sin = math.cos(self.angle), math.sin(self.angle)
-        across = -1.0 if self.mirrored else 1.0
-        return np.array([[across * cos, -across * sin], [sin, cos]])
-
-
-@dataclass(frozen=True)
-class RandomTurns:
-    """Random turns for augmentation.
-
-    Args:
-        flip: mirrors half of the images.
-        rotate_deg: degrees in [0, 180]; the angle is uniform between minus and plus this value.
-
-    Raises:
-        ValueError: an angle out of range.
-    """
-
-    flip: bool = False
-    rotate_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        check("rotate_deg", self.rotate_deg, 0 <= self.rotate_deg <= 180, "in [0, 180]")
-
-    def draw(self, rng: np.random.Generator) -> Turn:
-        """A random turn."""
-        angle = rng.uniform(-1, 1) * math.radians(self.rotate_deg)
-        return Turn(angle, bool(rng.random() < 0.5) and self.flip)
-
-
-def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
-    """The lens of a picture after a turn about its optical axis, and the matrix (2, 3) that moves a
-    pixel (x, y, 1) to its new place."""
-    lens, matrix = rotated(lens, turn.angle)
-    moves = matrix.numpy()
-    if turn.mirrored:
-        assert lens.image_size is not None
-        moves = moves * [[-1.0], [1.0]]
-        moves[0, 2] += lens.image_size[0, 1].item() - 1
-        lens = upright(lens, _MIRRORED)
-    return lens, moves
-
-
-def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
-    """A picture and its lens after a turn about the optical axis. The picture keeps its size. It is
-    sheared if its pixels are oblong, so that it looks rotated through its lens."""
-    if turn.angle:
-        lens, matrix = rotated(lens, turn.angle)
-        height, width = image.shape[:2]
-        shape = image.shape
-        image = cv2.warpAffine(image, matrix.numpy(), (width, height)).reshape(shape)
-    if turn.mirrored:
-        image, lens = np.ascontiguousarray(image[:, ::-1]), upright(lens, _MIRRORED)
-    return image, lens
-
-
-# -- at a model's size, and back --------------------------------------------------------------
-
-
-def at_size(image: np.ndarray, lens: Lens, size: int, framing: Framing) -> tuple[np.ndarray, Lens]:
-    """A picture (H, W, C) uint8 and its lens at a model's `size`, px.
-
-    Args:
-        lens: the lens, with the image_size of the picture.
-        framing: "crop" cuts the longer side, "stretch" squashes it, and "whole" keeps the aspect
-            ratio and gives the shorter side the size.
-
-    Returns:
-        (size, size, C) uint8, or a longer side with "whole"; and `lens_at_size`.
-
-    Raises:
-        ValueError: an unknown `framing`.
-    """
-    top, left, height, width = taken_part(image.shape[:2], framing)
-    part = image[top : top + height, left : left + width]
-    new_size = _new_size(height, width, size, framing)
-    return area_resized(part, new_size), lens_at_size(lens, size, framing)
+    return cv2.remap(image, places, None, interpolation)  # type: ignore[call-overload]
 
 
 def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -170,23 +46,28 @@ def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return image.reshape(height, width, -1)
 
 
-def lens_at_size(lens: Lens, size: int, framing: Framing) -> Lens:
+# -- at a model's size ------------------------------------------------------------------------
+
+
+def lens_at_size(lens: Lens, size: int, fit: Fit) -> Lens:
     """The exact lens of a picture after `at_size`, even if its pixels become oblong.
 
     Args:
         lens: the lens, with the image_size of the picture.
     """
-    part = taken_part(picture_size(lens), framing)
-    if framing == "crop":
-        lens = lens.cropped(*part)
-    return lens.resized(_new_size(*part[2:], size, framing))
+    part = taken_part(picture_size(lens), fit)
+    return lens.cropped(*part).resized(size_of_part(part, size, fit))
 
 
 def picture_size(lens: Lens) -> tuple[int, int]:
+    """(H, W) of the pictures of one lens."""
     if lens.image_size is None:
         raise ValueError("a lens that follows its picture needs an image_size")
     height, width = lens.image_size[0].tolist()
     return round(height), round(width)
+
+
+Part = tuple[int, int, int, int]  # top, left, height, width
 
 
 class Crop(NamedTuple):
@@ -198,14 +79,10 @@ class Crop(NamedTuple):
     down: float
 
 
-def taken_part(
-    size: tuple[int, ...], framing: Framing, crop: Crop | None = None
-) -> tuple[int, int, int, int]:
-    """The part of a picture (H, W) that is kept: top, left, height, width."""
-    if framing not in get_args(Framing):
-        allowed = ", ".join(get_args(Framing))
-        raise ValueError(f"framing must be one of {allowed}, got {framing!r}")
-    height, width = (min(size),) * 2 if framing == "crop" else size
+def taken_part(size: tuple[int, ...], fit: Fit, crop: Crop | None = None) -> Part:
+    """The part of a picture (H, W) that is kept."""
+    check("fit", repr(fit), fit in get_args(Fit), f"one of {', '.join(get_args(Fit))}")
+    height, width = (min(size),) * 2 if fit == "crop" else size
     if crop is None:
         return (size[0] - height) // 2, (size[1] - width) // 2, height, width
     height, width = (max(1, round(crop.share * side)) for side in (height, width))
@@ -213,18 +90,27 @@ def taken_part(
     return top, left, height, width
 
 
+def size_of_part(part: Part, size: int, fit: Fit) -> tuple[int, int]:
+    """(H, W) of a part at a model's size."""
+    height, width = part[2:]
+    if fit != "whole":
+        return size, size
+    scale = size / min(height, width)
+    return round(height * scale), round(width * scale)
+
+
 class CutOff(UserWarning):
     """A warning of parts of pictures that a model does not see."""
 
 
-def cut_off(size: tuple[int, int], lens: Lens | None, framing: Framing) -> str | None:
-    """What a framing cuts off pictures of (H, W), in words; None if nothing is lost.
+def cut_off(size: tuple[int, int], lens: Lens | None, fit: Fit) -> str | None:
+    """What a fit cuts off pictures of (H, W), in words; None if nothing is lost.
 
     Args:
         lens: the lens of the pictures, with this image_size. The text then names the angles that
             are lost, and pixels that no ray reaches do not count. None means that it is unknown.
     """
-    top, left, height, width = taken_part(size, framing)
+    top, left, height, width = taken_part(size, fit)
     if (height, width) == size:
         return None
     theta = np.zeros(size) if lens is None else _angles(lens)
@@ -246,11 +132,7 @@ def cut_off(size: tuple[int, int], lens: Lens | None, framing: Framing) -> str |
     return f"{text} ({share:.2g} % of what their lens sees, from {first} to {last} off its axis)"
 
 
-def _new_size(height: int, width: int, size: int, framing: Framing) -> tuple[int, int]:
-    if framing != "whole":
-        return size, size
-    scale = size / min(height, width)
-    return round(height * scale), round(width * scale)
+# -- and back ----------------------------------------------------------------------------------
 
 
 class FullSize:
@@ -264,18 +146,18 @@ class FullSize:
         reached: (h, w), True for pixels of the network that a ray reaches.
 
     Args:
-        lens: the lens, with the image_size of the pictures. size, framing: those of `at_size`.
+        lens: the lens, with the image_size of the pictures. size, fit: those of `at_size`.
 
     Raises:
-        ValueError: a lens without an image_size, or several; an unknown `framing`.
+        ValueError: a lens without an image_size, or several; an unknown `fit`.
     """
 
-    def __init__(self, lens: Lens, size: int, framing: Framing):
+    def __init__(self, lens: Lens, size: int, fit: Fit):
         if lens.image_size is None or len(lens) != 1:
             raise ValueError("FullSize takes one lens, with the image_size of its pictures")
-        top, left, self._height, self._width = taken_part(picture_size(lens), framing)
+        top, left, self._height, self._width = taken_part(picture_size(lens), fit)
         self._part = np.s_[top : top + self._height, left : left + self._width]
-        self.reached = _reached(lens_at_size(lens, size, framing))
+        self.reached = _reached(lens_at_size(lens, size, fit))
         self._weight = self._enlarged(self.reached)
         reached = _reached(lens)
         self.seen = np.zeros_like(reached)
@@ -308,9 +190,13 @@ class FullSize:
         Returns:
             (H, W) float32, m; 0 without an answer.
         """
-        logarithm = np.log(np.where(self.reached, distance, 1))
+        metres = np.exp(self.values(np.log(np.where(self.reached, distance, 1))))
+        return np.where(self.seen, metres, np.float32(0))
+
+    def values(self, values: np.ndarray) -> np.ndarray:
+        """Any values (h, w), interpolated linearly: (H, W) float32, 0 without an answer."""
         weight = np.where(self._weight > 0, self._weight, 1)
-        return self._in_picture(np.exp(self._weighted(logarithm) / weight), 0.0)
+        return self._in_picture(self._weighted(values) / weight, 0)
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
         """Values (h, w) at the pixels that `at_size` kept, times the share that a ray reaches."""

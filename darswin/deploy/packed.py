@@ -35,9 +35,9 @@ def _operator(name: str) -> Callable[..., Any]:
 _ADD_NORM = _operator("_add_norm_")
 _ADD_NORM_QUANTIZED = _operator("_add_norm_quantized_")
 _NORM = _operator("_norm")
+_PACK = _operator("_pack_linear")
 _LINEAR = _operator("_linear")
 _BLOCKS = _operator("_blocks_")
-_PANEL, _UNIT = 48, 16  # as in csrc/linear.h
 
 
 def has_own_int8() -> bool:
@@ -47,26 +47,12 @@ def has_own_int8() -> bool:
 
 
 def packed_weights(linear: nn.Linear | QuantizedLinear) -> Tensor:
-    """A linear layer in the order of csrc/linear.h, (K,): float32, or int32 if it is quantized."""
+    """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
     weight = linear.weight.detach()
-    bias = torch.zeros(len(weight)) if linear.bias is None else linear.bias.detach().float()
+    bias = None if linear.bias is None else linear.bias.detach().float()
     if isinstance(linear, QuantizedLinear):
-        scale, zero_point = linear.activation
-        offset = -zero_point * weight.sum(1, dtype=torch.int32)
-        parameters = [_bits(bias), _bits(linear.weight_scale.float()), offset]
-        weight = _bits(F.pad(weight, (0, -weight.shape[1] % 4)))
-        last = [_bits(torch.tensor([scale, 1 / scale])), offset.new_tensor([zero_point])]
-    else:
-        parameters, weight, last = [bias], weight.float(), []
-    padding = -len(weight) % _UNIT
-    columns = [F.pad(parameter, (0, padding)) for parameter in parameters]
-    panels = F.pad(weight, (0, 0, 0, padding)).split(_PANEL)
-    return torch.cat([*columns, *(panel.t().flatten() for panel in panels), *last])
-
-
-def _bits(t: Tensor) -> Tensor:
-    """The bits of a tensor as int32, which joins four numbers of 8 bits."""
-    return t.contiguous().view(torch.int32)
+        return _PACK(weight, bias, linear.weight_scale.float(), *linear.activation)
+    return _PACK(weight.float(), bias)
 
 
 def norm_parameters(norm: nn.LayerNorm) -> Tensor:

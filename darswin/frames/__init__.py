@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "Sampler", "plan"]
 
 Output = Literal["tokens", "image", "uint8"]
-_VERSION = 1
+_VERSION = 2
 _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
 
@@ -63,8 +63,6 @@ class Plan:
             is (H', W', C), as OpenCV has it.
         mean, std: normalization `(pixel/255 - mean) / std`, one number for each channel, or one for
             all; "uint8" is not normalized.
-        normalize_first: normalizes the pixels before the interpolation, as the operators do for
-            small images; the results differ in rounding only.
 
     Raises:
         ValueError: mean and std are not 1 or 3 finite numbers each, or a std is not above 0.
@@ -78,7 +76,6 @@ class Plan:
     output: Output
     mean: tuple[float, ...] = (0.0,)
     std: tuple[float, ...] = (1.0,)
-    normalize_first: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("mean", -math.inf), ("std", 0.0)):
@@ -119,6 +116,9 @@ class Plan:
     def load(cls, path: str | os.PathLike) -> "Plan":
         """Reads a plan from a file.
 
+        Files of version 1 are read too. Some of them normalize before they interpolate; the samples
+        of such a plan now differ from those of its time by rounding.
+
         Raises:
             ValueError: the file is no plan, is damaged, or comes from a newer version of darswin.
             OSError: the file cannot be read.
@@ -149,7 +149,6 @@ class Plan:
                 output=content["output"].item(),
                 mean=tuple(content["mean"].tolist()),
                 std=tuple(content["std"].tolist()),
-                normalize_first=bool(content["normalize_first"]),
             )
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
@@ -173,8 +172,7 @@ class Sampler:
 
     `out` is an array for the result: C-contiguous, with its shape and type, and in other memory
     than the frame. `threads` is the most threads to use; small plans use fewer. The tokens and the
-    polar image are those of `darswin.ops.polar_sample`, bit for bit. On CPUs without AVX-512,
-    single samples of small frames may differ in the last bit.
+    polar image are those of `darswin.ops.polar_sample`, bit for bit.
 
     Args:
         plan: a `Plan`, or its file.
@@ -194,7 +192,7 @@ class Sampler:
                 plan.columns, plan.rows, plan.right, plan.lower, plan.size,
                 [1 / (255 * std) for std in plan.std],
                 [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
-                plan.normalize_first, plan.output,
+                plan.output,
             )  # fmt: skip
         except TypeError as error:
             raise ValueError("the parts of the plan do not fit together") from error
@@ -234,7 +232,7 @@ def plan(
             the images as they are, a side is longer than 32,767 pixels, the output is unknown, mean
             or std do not fit the channels, or they are missing and the model has none.
     """
-    from darswin.frames.places import reading
+    from darswin.frames.reading import reading
     from darswin.ops.checks import check_pair, per_channel
 
     if output is not None and output not in get_args(Output):
@@ -274,17 +272,16 @@ def _on_grid(
         None if x is None else x.float().numpy() for x in (grid.affine, grid.offsets)
     )
     radii, azimuths, center = (x.float().numpy() for x in (grid.radii, grid.azimuths, grid.center))
-    *arrays, packed = _frames.polar_places(radii, azimuths, center, affine, offsets, size)
+    arrays = _frames.polar_places(radii, azimuths, center, affine, offsets, size)
     if output == "tokens":
         (rows, columns), (sr, sa) = arrays[0].shape, samples
-        arrays = [
+        arrays = tuple(
             np.ascontiguousarray(
                 array.reshape(rows // sr, sr, columns // sa, sa).transpose(0, 2, 1, 3)
             )
             for array in arrays
-        ]
-    names = ("columns", "rows", "right", "lower")
-    return dict(zip(names, arrays, strict=True), normalize_first=packed)
+        )
+    return dict(zip(("columns", "rows", "right", "lower"), arrays, strict=True))
 
 
 def _at_pixels(points: np.ndarray, size: tuple[int, int], output: Output) -> dict[str, Any]:

@@ -16,7 +16,6 @@ def sampler(
     size: tuple[int, int],
     scale: Sequence[float],
     offset: Sequence[float],
-    normalize_first: bool,
     output: str,
     /,
 ) -> _Sample: ...
@@ -28,4 +27,4 @@ def polar_places(
     offsets: np.ndarray | None,
     size: tuple[int, int],
     /,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool]: ...
+) -> tuple[np.ndarray, ...]: ...

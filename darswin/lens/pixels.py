@@ -131,17 +131,6 @@ def reprojection(
     return as_map(source.seen_pixels(theta, direction, source_size))
 
 
-def radial_reprojection(source: Lens, target: Lens, radii: Tensor) -> Tensor:
-    """`reprojection` along one azimuth, for radial lenses without `affine`.
-
-    For radii (1, K) px, above 0, in the image of one lens `target`: the ratio of a ray's radius in
-    `source` to its radius in `target`; NaN where the ray is beyond either θ_max.
-    """
-    theta = target.unproject(radii)
-    seen = target.sees(theta) & source.sees(theta)
-    return torch.where(seen, source.project(torch.where(seen, theta, 0.0)) / radii, torch.nan)
-
-
 def as_map(pixels: Tensor) -> Tensor:
     """Pixels (..., 2) with `OUTSIDE` in place of NaN."""
     return torch.where(pixels.isnan(), OUTSIDE, pixels)

@@ -1,7 +1,7 @@
 """The base of the models that predict a class or a distance for every pixel, and their heads."""
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 import torch.nn.functional as F
@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.models.base import Model, init_by_width
+from darswin.utils.tasks import PixelTask
 
-PixelTask = Literal["segmentation", "distance"]
 # exp(±8): distances lie between 1/3000 of the typical distance and 3000 times that distance.
 LARGEST_EXPONENT = 8.0
 RAYS = 3  # the channels of viewing directions

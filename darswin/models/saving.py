@@ -18,10 +18,8 @@ from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, list_pretrained, no_weights, pretrained_file
-from darswin.utils.tasks import Task
+from darswin.utils.tasks import Fit, Task
 from darswin.utils.tensor_files import read_metadata, read_tensors, write_tensors
-
-Fit = Literal["crop", "stretch", "whole"]
 
 _ENTRY = "darswin"  # the key of the card in the metadata
 

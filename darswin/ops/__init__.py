@@ -9,13 +9,12 @@ with several threads: use `spawn`, or `torch.set_num_threads(1)` in the child.
 
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops._module import cpu_capability
-from darswin.ops.polar_sample import polar_embed, polar_sample
+from darswin.ops.polar_sample import polar_sample
 from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
 from darswin.ops.window_attention import window_attention
 
 __all__ = [
     "cpu_capability",
-    "polar_embed",
     "polar_sample",
     "polar_to_image",
     "polar_to_image_plan",

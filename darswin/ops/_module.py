@@ -36,8 +36,6 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
-    module.darswin_set_gathers.argtypes = [ctypes.c_int]
-    module.darswin_set_gathers.restype = None
     return module
 
 
@@ -61,15 +59,6 @@ def set_tier(tier: str) -> None:
         raise ValueError(
             f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
         )
-
-
-def set_gathers(use: bool | None) -> None:
-    """Reads large grey or RGB images with or without gather instructions.
-
-    None, the default, does what is faster on this CPU. The results are the same. Only the AVX-512
-    tier has gathers.
-    """
-    _loaded.darswin_set_gathers(2 if use is None else int(use))
 
 
 def build_info() -> dict[str, str | int]:

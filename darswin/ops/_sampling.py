@@ -1,4 +1,4 @@
-"""The arguments that polar_sample and polar_embed share, and their checks."""
+"""The arguments of polar_sample, and their checks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,5 +1,4 @@
-"""polar_sample samples an image on a polar grid; polar_embed also maps its patches to tokens with a
-linear layer. Public functions, fakes and autograd."""
+"""polar_sample samples an image on a polar grid. Public function, fake and autograd."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -9,10 +8,9 @@ from torch import Tensor
 
 from darswin.ops import _library, reference
 from darswin.ops._sampling import GRADIENTS, Sampling, as_sampling, check_sampling
-from darswin.ops.checks import check_layout, check_tensor
+from darswin.ops.checks import check_layout
 
 _SAMPLE = torch.ops.darswin.polar_sample.default
-_EMBED = torch.ops.darswin.polar_embed.default
 
 
 def polar_sample(
@@ -35,7 +33,7 @@ def polar_sample(
 
     Point (i, j) of image b lies at `(x, y) = center + affine @ (r cos a, r sin a) +
     offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A circular lens needs
-    neither affine nor offsets. `polar_embed` includes the linear layer of a patch embedding.
+    neither affine nor offsets.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
@@ -112,92 +110,3 @@ def _fake(*arguments):
 
 
 _library.register_gradients("polar_sample", GRADIENTS)
-
-
-def polar_embed(
-    image: Tensor,
-    radii: Tensor,
-    azimuths: Tensor,
-    center: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    *,
-    affine: Tensor | None = None,
-    offsets: Tensor | None = None,
-    samples: tuple[int, int],
-    jitter: float = 0.0,
-    seed: int | Tensor = 0,
-    mean: float | Sequence[float] = 0.0,
-    std: float | Sequence[float] = 1.0,
-    channels_last: bool | None = None,
-) -> Tensor:
-    """Samples the patches of a polar grid and maps each to a token: `F.linear(polar_sample(...))`.
-
-    The samples are never written to memory; backward recomputes them.
-
-    Args:
-        image, radii, azimuths, center, affine, offsets, samples: see `polar_sample`.
-        jitter, seed, mean, std, channels_last: see `polar_sample`.
-        weight: (D, S_r·S_φ·C), float64 if the image is float64, else float32 or bfloat16.
-        bias: (D,) or None, with the dtypes of weight.
-
-    Returns:
-        (B, R, A, D). The dtype is bfloat16 for a bfloat16 image or under bfloat16 autocast, float64
-        for a float64 image, else float32. bfloat16 results are computed in float32 and rounded
-        once.
-
-    backward() gives gradients for weight, bias, image (unless uint8), radii, center, affine and
-    offsets. Results and gradients do not depend on the number of threads.
-
-    Raises:
-        TypeError, ValueError: see `polar_sample`; or a weight or bias does not fit.
-        NotImplementedError: see `polar_sample`.
-
-    Source: DarSwin, ICCV 2023, sec. 4.3.
-    """
-    sampling = as_sampling(
-        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
-        channels_last,
-    )  # fmt: skip
-    return _library.call(_EMBED, _check_embed, _reference_embed, (*sampling, weight, bias))
-
-
-def _check_embed(*arguments) -> None:
-    check_sampling(*arguments)
-    *fields, weight, bias = arguments
-    sampling = Sampling(*fields)
-    image, size = sampling.image, sampling.token_size()
-    double = image.dtype == torch.float64
-    dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
-    form = "(D, S_r·S_φ·C) = (any, {})"
-    check_tensor("weight", weight, dtypes, form, (None, size), like=image)
-    if bias is not None:
-        check_tensor("bias", bias, dtypes, "(D,) = ({},)", (weight.shape[0],), like=image)
-
-
-def _reference_embed(*arguments):
-    *fields, weight, bias = arguments
-    return reference.polar_embed(Sampling(*fields), weight, bias)
-
-
-@torch.library.register_fake("darswin::polar_embed")
-def _fake_embed(*arguments):
-    _check_embed(*arguments)
-    *fields, weight, _bias = arguments
-    sampling = Sampling(*fields)
-    return sampling.new_output((*sampling.map_size(), weight.shape[0]))
-
-
-_FIELDS = len(Sampling._fields)  # weight and bias come after them
-
-
-def _fake_embed_backward(*arguments):
-    weight, *_, weight_grad = arguments[_FIELDS:]
-    of_sampling = _library.empty_gradients(arguments, GRADIENTS, arguments[-4:-1])
-    shapes = (weight.shape, weight.shape[:1]) if weight_grad else ((0,), (0,))
-    return *of_sampling, *(arguments[1].new_empty(shape) for shape in shapes)
-
-
-_library.register_gradients(
-    "polar_embed", GRADIENTS | {_FIELDS: 3, _FIELDS + 1: 3}, _fake_embed_backward
-)

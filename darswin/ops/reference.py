@@ -9,13 +9,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.ops._sampling import Sampling
 from darswin.ops.checks import tensor_there
 
-__all__ = ["polar_embed", "polar_sample", "polar_to_image", "window_attention"]
+__all__ = ["polar_sample", "polar_to_image", "window_attention"]
 
 _WORD = 0xFFFFFFFF
 
@@ -138,19 +137,6 @@ def laid_out(out: Tensor, sampling: Sampling, tokens: bool) -> Tensor:
     size, (along, around) = sampling.map_size(), sampling.samples
     out = out.reshape(*out.shape[:2], size[1], along, size[2], around)
     return out.permute(0, 2, 4, 3, 5, 1).reshape(*size, sampling.token_size())
-
-
-def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """See `darswin.ops.polar_embed`."""
-    return embedded(polar_sample(sampling._replace(bfloat16=False), True), sampling, weight, bias)
-
-
-def embedded(samples: Tensor, sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Applies the linear layer to the samples (B, R, A, S_r·S_φ·C)."""
-    weight = weight.to(samples.dtype)
-    bias = None if bias is None else bias.to(samples.dtype)
-    out = F.linear(samples, weight, bias)
-    return out.bfloat16() if sampling.bfloat16 else out
 
 
 def polar_to_image(

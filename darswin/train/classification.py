@@ -13,14 +13,14 @@ from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.augment import Mixing, partners_share
 from darswin.data.lens_distributions import SphericalLenses, parse_lenses
-from darswin.train.task import Batch, Task, finite_loss
+from darswin.train.task import Batch, TaskModule, finite_loss
 from darswin.utils.parameters import check
 from darswin.viz.plot import draw_accuracy, page_figure
 
 __all__ = ["Classification"]
 
 
-class Classification(Task):
+class Classification(TaskModule):
     """A classifier of wide-angle images, with its loss, its optimiser and its accuracy.
 
     After a test, a row of `results` has `lenses`, the name of the test set; `n`, its number of
@@ -37,7 +37,7 @@ class Classification(Task):
         mixup: α of Beta(α, α), the distribution of the share of each image in a mixture; 0 is off.
         cutmix: α for mixtures that replace a box of the image; 0 is off.
         mix_p: the share of batches that are mixed.
-        common: as `Task`.
+        common: as `TaskModule`.
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
     """

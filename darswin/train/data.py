@@ -17,13 +17,15 @@ from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
+from darswin.data.reframing import RandomTurns
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
-from darswin.data.warping import CutOff, Framing, RandomTurns
+from darswin.data.warping import CutOff
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals
 from darswin.utils.parameters import check, naming
+from darswin.utils.tasks import Fit
 
 __all__ = ["RunData", "WideAngleData"]
 
@@ -77,7 +79,7 @@ class RunData(LightningDataModule):
     default_size: ClassVar[int] = 64  # of large pictures
     # For the model's card.
     fov: float
-    frame_fit: Framing
+    card_fit: Fit
     colors: Sequence[Sequence[int]] = []
     pair_lenses = False  # True if the two images of a mixture share a lens
 
@@ -130,7 +132,7 @@ class RunData(LightningDataModule):
         self._said_cut_off = False
 
     @property
-    def framing(self) -> Framing:
+    def fit(self) -> Fit:
         """How pictures become squares."""
         return self._fit or "stretch"
 
@@ -189,7 +191,7 @@ class RunData(LightningDataModule):
     @property
     def _form(self) -> dict[str, Any]:
         return dict(
-            size=self.size, framing=self.framing, mean=self.mean, std=self.std, seed=self.seed,
+            size=self.size, fit=self.fit, mean=self.mean, std=self.std, seed=self.seed,
             skip_broken=self._skip_broken,
         )  # fmt: skip
 
@@ -207,7 +209,7 @@ class RunData(LightningDataModule):
         return source if self.limit is None else source.limited(self.limit)
 
     def _noted(self, dataset: SamplesT) -> SamplesT:
-        """The data set, whose broken pictures `broken` will count. The first one that the framing
+        """The data set, whose broken pictures `broken` will count. The first one that `fit`
         cuts something off brings a warning."""
         self.datasets.append(dataset)
         if not self._said_cut_off and not self._place["rank"] and (lost := dataset.cut_off()):
@@ -341,11 +343,11 @@ class WideAngleData(RunData):
             render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
-        self.frame_fit = self.framing if self._lens else "whole"
+        self.card_fit = self.fit if self._lens else "whole"
         self.erasing, self.pair_lenses = erasing, pair_lenses
 
     @property
-    def framing(self) -> Framing:
+    def fit(self) -> Fit:
         """How pictures become squares."""
         return self._fit or ("stretch" if self._lens else "crop")
 

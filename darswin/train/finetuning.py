@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from torch import nn
 
@@ -14,7 +14,7 @@ from darswin.models.registry import list_models, model_class, nearest_models, pr
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
 from darswin.utils.parameters import check, naming
-from darswin.utils.tasks import Task
+from darswin.utils.tasks import PixelTask, Task
 
 # Options of a model that follow from the data.
 OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")
@@ -127,7 +127,7 @@ def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
 
 
 def _of_head(name: str) -> bool:
-    return name.startswith(("head.", "segmentation_head.", "distance_head."))
+    return name.startswith(("head.", *(f"{task}_head." for task in get_args(PixelTask))))
 
 
 def frozen_parts(net: Encoder | PixelModel, stages: int) -> list[nn.Module]:

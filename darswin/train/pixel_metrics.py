@@ -16,9 +16,6 @@ from torchmetrics import Metric
 from darswin.utils.parameters import check
 
 BY_AREA = "_sr"  # the ending of scores that are weighted by solid angle, in steradians
-# δ1, δ2, δ3: the larger of two distances is less than this many times the other.
-_RATIOS = (1.25, 1.25**2, 1.25**3)
-DISTANCE_METRICS = ("abs_rel", "sq_rel", "rmse", "rmse_log", "silog", "delta1", "delta2", "delta3")
 
 
 class Zones:
@@ -70,86 +67,16 @@ class PixelSums(Metric):
         raise NotImplementedError
 
 
-class LabelSums(PixelSums):
-    """Confusion counts (Z, K, K): pixels of class i that were predicted as class j. The mean IoU
-    leaves out the class `left_out`."""
-
-    # The confusion counts of torchmetrics have no weights.
-
-    def __init__(self, classes: int, zones: int, left_out: int | None = None):
-        super().__init__(zones, (classes, classes), torch.int64)
-        self.classes, self.left_out = classes, left_out
-
-    def update(self, predicted: Tensor, labels: Tensor, zone: Tensor, area: Tensor) -> None:
-        """Adds pixels (P,): predictions, labels, zones and solid angles (sr)."""
-        cell = (zone * self.classes + labels) * self.classes + predicted
-        cells = self.counts.numel()
-        self.counts += torch.bincount(cell, minlength=cells).view_as(self.counts)
-        weighted = torch.bincount(cell, area.double(), minlength=cells)
-        self.areas += weighted.view_as(self.areas)
-
-    def pixels(self, counts: Tensor) -> int:
-        return int(counts.sum())
-
-    def scores(self, sums: Tensor) -> dict[str, float]:
-        """`accuracy`, and `miou` over the classes in the truth or the prediction."""
-        iou, _ = iou_and_recall(sums)
-        if self.left_out is not None:
-            iou[self.left_out] = torch.nan
-        accuracy = _ratio(sums.diagonal().double().sum(), sums.double().sum())
-        return dict(miou=iou.nanmean().item(), accuracy=accuracy.item())
-
-
-def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
-    """IoU and recall of each class, (K,), from confusion counts (K, K) of truth and prediction; NaN
-    for a class that does not occur."""
-    confusion = confusion.double()
-    right, present = confusion.diagonal(), confusion.sum(1)
-    return _ratio(right, present + confusion.sum(0) - right), _ratio(right, present)
-
-
-class DistanceSums(PixelSums):
-    """Sums of the terms of the distance errors, (Z, 9); the first term is the weight."""
-
-    def __init__(self, zones: int):
-        super().__init__(zones, (9,))
-
-    def update(self, predicted: Tensor, distance: Tensor, zone: Tensor, area: Tensor) -> None:
-        """Adds pixels (P,): two distances above 0 (m), zones and solid angles (sr)."""
-        predicted, distance = predicted.double(), distance.double()
-        off, log = predicted - distance, predicted.log() - distance.log()
-        larger = torch.maximum(predicted / distance, distance / predicted)
-        terms = torch.stack((
-            torch.ones_like(off), off.abs() / distance, off.square() / distance, off.square(),
-            log.square(), log, *((larger < ratio).double() for ratio in _RATIOS),
-        ), 1)  # fmt: skip
-        for number in range(len(self.counts)):
-            inside = zone == number
-            self.counts[number] += terms[inside].sum(0)
-            self.areas[number] += (terms[inside] * area[inside].double()[:, None]).sum(0)
-
-    def pixels(self, counts: Tensor) -> int:
-        return round(counts[0].item())
-
-    def scores(self, sums: Tensor) -> dict[str, float]:
-        """`DISTANCE_METRICS`; `silog` is 100 √(mean g² - (mean g)²), g the difference of logs.
-
-        Source: Eigen et al., NeurIPS 2014; SILog as in KITTI's depth benchmark.
-        """
-        weight = sums[0].item()
-        if weight == 0:
-            return dict.fromkeys(DISTANCE_METRICS, math.nan)
-        abs_rel, sq_rel, square, log_square, log, *deltas = (sums[1:] / weight).tolist()
-        silog = 100 * math.sqrt(max(log_square - log**2, 0.0))
-        found = (abs_rel, sq_rel, math.sqrt(square), math.sqrt(log_square), silog, *deltas)
-        return dict(zip(DISTANCE_METRICS, found, strict=True))
-
-
 def none_of_nan(value: float) -> float | None:
     """The value, or None for NaN, because JSON has no NaN."""
     return None if math.isnan(value) else value
 
 
-def _ratio(part: Tensor, whole: Tensor) -> Tensor:
+def ratio(part: Tensor, whole: Tensor) -> Tensor:
     """part / whole, NaN where `whole` is 0."""
     return torch.where(whole > 0, part / torch.where(whole > 0, whole, 1), torch.nan)
+
+
+def or_one(whole: Tensor) -> Tensor:
+    """The divisor, with 1 in place of 0."""
+    return torch.where(whole > 0, whole, 1.0)

@@ -12,10 +12,10 @@ from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan
-from darswin.train.task import Batch, Task, finite_loss
+from darswin.train.task import Batch, TaskModule, finite_loss
 from darswin.viz.pixels import Row, draw_predictions
 
-__all__ = ["PixelTask"]
+__all__ = ["PixelModule"]
 
 _SHOWN = 4  # samples in the figure of a test
 _EARLY = 100  # batches after which a training without any target stops
@@ -30,7 +30,7 @@ class Measured(nn.Module):
         self.sums, self.loss, self.images = sums, MeanMetric(), SumMetric()
 
 
-class PixelTask(Task):
+class PixelModule(TaskModule):
     """Base of the tasks that predict each pixel.
 
     Subclasses define `_criterion`, `_answer`, `_known`, `_check_targets`, `_sums`, `nothing` (the
@@ -46,7 +46,7 @@ class PixelTask(Task):
             separately; null is 30, 60, 90.
         solid_angle_weights: weights the pixels in the loss by their solid angles, with a mean of 1
             in each image.
-        common: as `Task`.
+        common: as `TaskModule`.
 
     Attributes:
         results: after a test, a row for each test set: `data`, its name; `n`, the number of images

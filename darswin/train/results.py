@@ -11,7 +11,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 
 from darswin.train.pixel_metrics import BY_AREA
-from darswin.train.task import Task
+from darswin.train.task import TaskModule
 from darswin.utils.files import replace_file
 from darswin.viz.plot import save_figure
 
@@ -57,7 +57,7 @@ class WriteResults(Callback):
     @rank_zero_only
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Prints the tables and writes the files."""
-        assert isinstance(pl_module, Task)
+        assert isinstance(pl_module, TaskModule)
         names = []
         for name, table in tables(pl_module.results).items():
             replace_file(self.folder / name, _csv(table))

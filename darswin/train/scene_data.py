@@ -1,11 +1,8 @@
 """Scenes with a label or a distance for each pixel, for segmentation and distance."""
 
-import math
 import os
 from pathlib import Path
 from typing import Any, ClassVar
-
-import torch
 
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
@@ -13,10 +10,8 @@ from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
-from darswin.train.task import Batch
-from darswin.utils.parameters import check
 
-__all__ = ["DistanceData", "LabelData", "SceneData"]
+__all__ = ["SceneData"]
 
 
 class SceneData(RunData):
@@ -46,7 +41,7 @@ class SceneData(RunData):
         **common: Any,
     ):
         super().__init__(path, batch_size=batch_size, **common)
-        self.frame_fit = self.framing
+        self.card_fit = self.fit
         self.test_paths = test_paths or []
         self.crop = crop
 
@@ -101,46 +96,3 @@ class SceneData(RunData):
             "train", turns=self.turns, crop=self.crop, lens_augmentation=self.lens_augmentation,
             augment=self.colour_changes,
         )  # fmt: skip
-
-
-class LabelData(SceneData):
-    """Scenes with a label for each pixel.
-
-    Args:
-        path: a folder of scenes: see `darswin.data.open_scenes`.
-        label_map: a JSON file that gives ids in the label files their classes, by name or by id,
-            such as {"7": "road", "8": 1, "9": null}; null means unlabelled. It must have all ids
-            that are not the data set's own.
-        common: as `SceneData`.
-    """
-
-    target = "labels"
-
-    def __init__(self, path: str, *, label_map: str | None = None, **common: Any):
-        super().__init__(path, **common)
-        self._opening["label_map"] = label_map
-
-
-class DistanceData(SceneData):
-    """Scenes with a distance for each pixel.
-
-    Args:
-        path: a folder of scenes: see `darswin.data.open_scenes`.
-        max_distance: m; larger distances count as unknown. null has no limit.
-        common: as `SceneData`.
-    """
-
-    target = "distance"
-
-    def __init__(self, path: str, *, max_distance: float | None = None, **common: Any):
-        super().__init__(path, **common)
-        if max_distance is not None:
-            check("max_distance", max_distance, 0 < max_distance < math.inf, "above 0")
-        self.max_distance = max_distance
-
-    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """The batch, with distances above `max_distance` as unknown."""
-        if self.max_distance is None:
-            return batch
-        images, lens, distance = batch
-        return images, lens, torch.where(distance > self.max_distance, 0.0, distance)

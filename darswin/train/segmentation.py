@@ -1,34 +1,126 @@
-"""Segmentation (a class for each pixel) and distance (metres along the ray for each pixel)."""
+"""Segmentation, a class for each pixel: its task, data, loss and scores."""
 
 import math
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import some
 from darswin.ops.checks import tensor_there
-from darswin.train.losses import DistanceLoss, LabelLoss, distance_loss, label_loss
-from darswin.train.pixel_metrics import (
-    BY_AREA,
-    DistanceSums,
-    LabelSums,
-    iou_and_recall,
-    none_of_nan,
-)
-from darswin.train.pixel_task import PixelTask
+from darswin.train.pixel_metrics import BY_AREA, PixelSums, none_of_nan, or_one, ratio
+from darswin.train.pixel_task import PixelModule
+from darswin.train.scene_data import SceneData
 from darswin.utils.parameters import check, naming
 
-__all__ = ["Distance", "Segmentation"]
+__all__ = ["LabelData", "Segmentation", "label_loss"]
+
+LabelLoss = Literal["ce", "dice", "ce+dice"]
+
+
+def label_loss(
+    logits: Tensor,
+    labels: Tensor,
+    kind: LabelLoss = "ce",
+    *,
+    class_weights: Tensor | None = None,
+    label_smoothing: float = 0.0,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """Cross-entropy, soft Dice, or the sum of both; pixels with the label `IGNORE` do not count.
+
+    Args:
+        logits: (B, K, H, W). labels: (B, H, W), ids.
+        class_weights: (K,), the weight of each class; None weights all by 1.
+        label_smoothing: for the cross-entropy, in [0, 1).
+        weights: (B, H, W), the weight of each pixel; None weights all by 1.
+
+    Returns:
+        A scalar.
+    """
+    loss = logits.new_zeros(())
+    if kind != "dice":
+        each = F.cross_entropy(
+            logits, labels, class_weights, ignore_index=IGNORE, reduction="none",
+            label_smoothing=label_smoothing,
+        )  # fmt: skip
+        known = labels != IGNORE
+        share = known.to(each.dtype)
+        if class_weights is not None:
+            share = share * class_weights[torch.where(known, labels, 0)]
+        if weights is not None:
+            each, share = each * weights, share * weights
+        loss = loss + each.sum() / or_one(share.sum())
+    if kind != "ce":
+        loss = loss + _dice(logits, labels, class_weights, weights)
+    return loss
+
+
+def _dice(
+    logits: Tensor, labels: Tensor, class_weights: Tensor | None, weights: Tensor | None
+) -> Tensor:
+    """1 - Dice over all pixels of the batch, a mean over the classes in the labels.
+
+    Source: V-Net, 3DV 2016, with a sum in place of squares in the denominator.
+    """
+    known = labels != IGNORE
+    share = known.to(logits.dtype) if weights is None else known * weights
+    truth = F.one_hot(torch.where(known, labels, 0), logits.shape[1]).permute(0, 3, 1, 2)
+    truth = truth * share[:, None]
+    predicted = logits.softmax(1) * share[:, None]
+    both, either = (predicted * truth.gt(0)).sum((0, 2, 3)), (predicted + truth).sum((0, 2, 3))
+    present = truth.sum((0, 2, 3)) > 0
+    missed = torch.where(present, 1 - 2 * both / or_one(either), 0.0)
+    counts = present.to(logits.dtype) if class_weights is None else present * class_weights
+    return (missed * counts).sum() / or_one(counts.sum())
+
+
+class LabelSums(PixelSums):
+    """Confusion counts (Z, K, K): pixels of class i that were predicted as class j. The mean IoU
+    leaves out the class `left_out`."""
+
+    # The confusion counts of torchmetrics have no weights.
+
+    def __init__(self, classes: int, zones: int, left_out: int | None = None):
+        super().__init__(zones, (classes, classes), torch.int64)
+        self.classes, self.left_out = classes, left_out
+
+    def update(self, predicted: Tensor, labels: Tensor, zone: Tensor, area: Tensor) -> None:
+        """Adds pixels (P,): predictions, labels, zones and solid angles (sr)."""
+        cell = (zone * self.classes + labels) * self.classes + predicted
+        cells = self.counts.numel()
+        self.counts += torch.bincount(cell, minlength=cells).view_as(self.counts)
+        weighted = torch.bincount(cell, area.double(), minlength=cells)
+        self.areas += weighted.view_as(self.areas)
+
+    def pixels(self, counts: Tensor) -> int:
+        return int(counts.sum())
+
+    def scores(self, sums: Tensor) -> dict[str, float]:
+        """`accuracy`, and `miou` over the classes in the truth or the prediction."""
+        iou, _ = iou_and_recall(sums)
+        if self.left_out is not None:
+            iou[self.left_out] = torch.nan
+        accuracy = ratio(sums.diagonal().double().sum(), sums.double().sum())
+        return dict(miou=iou.nanmean().item(), accuracy=accuracy.item())
+
+
+def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
+    """IoU and recall of each class, (K,), from confusion counts (K, K) of truth and prediction; NaN
+    for a class that does not occur."""
+    confusion = confusion.double()
+    right, present = confusion.diagonal(), confusion.sum(1)
+    return ratio(right, present + confusion.sum(0) - right), ratio(right, present)
 
 
 class AbsentClass(UserWarning):
     """A class does not occur in the labels that a model is trained on."""
 
 
-class Segmentation(PixelTask):
+class Segmentation(PixelModule):
     """Predicts a class for each pixel of wide-angle images; measures mIoU, accuracy and IoU.
 
     The loss and the scores ignore pixels without a label and pixels beyond θ_max. mIoU is the mean
@@ -45,7 +137,7 @@ class Segmentation(PixelTask):
         ignore_index: the id of a class that loss and scores ignore, in addition to 255.
         label_smoothing: the share of each label that the cross-entropy spreads over all classes,
             in [0, 1).
-        common: as `PixelTask`.
+        common: as `PixelModule`.
     """
 
     task = "segmentation"
@@ -144,58 +236,19 @@ class Segmentation(PixelTask):
         }
 
 
-class Distance(PixelTask):
-    """Predicts the distance along the ray for each pixel of wide-angle images.
-
-    The loss and the scores ignore pixels of unknown distance and pixels beyond θ_max.
+class LabelData(SceneData):
+    """Scenes with a label for each pixel.
 
     Args:
-        name: the model; null is the model of `weights`, or darswin_unet_a_micro. If `weights` is a
-            classifier, it is the dense model with that encoder.
-        options: options of the model, e.g. {typical_distance: 3}. With `weights`, the model keeps
-            its own options; only drop_path_rate and jitter may differ.
-        loss: silog (the scale-invariant logarithmic error with λ = 0.85), l1 (the mean absolute
-            error in metres) or log_l1 (the mean absolute error of the logarithms).
-        common: as `PixelTask`.
+        path: a folder of scenes: see `darswin.data.open_scenes`.
+        label_map: a JSON file that gives ids in the label files their classes, by name or by id,
+            such as {"7": "road", "8": 1, "9": null}; null means unlabelled. It must have all ids
+            that are not the data set's own.
+        common: as `SceneData`.
     """
 
-    task = "distance"
-    nothing = 0
-    monitor = ("val/abs_rel", "min")
-    shown = ("abs_rel", "rmse", "delta1")
+    target = "labels"
 
-    def __init__(
-        self,
-        name: str | None = None,
-        options: dict[str, Any] | None = None,
-        *,
-        loss: DistanceLoss = "silog",
-        **common: Any,
-    ):
-        super().__init__(name, options, **common)
-        self.loss = loss
-
-    def _head_options(self) -> dict[str, Any]:
-        return dict(task="distance")
-
-    def _sums(self, zones: int) -> DistanceSums:
-        return DistanceSums(zones)
-
-    def _criterion(self, predicted: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
-        return distance_loss(predicted, target, self.loss, weights=weights)
-
-    def _answer(self, predicted: Tensor) -> Tensor:
-        return predicted[:, 0]
-
-    def _known(self, target: Tensor) -> Tensor:
-        return target > 0
-
-    def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:
-        if not any(found):
-            most = self.data.max_distance
-            text = (
-                f"none of the pixels of {images} has a known distance: all are 0 or not finite"
-                + (f", or above `max_distance` {most:g} m" if most is not None else "")
-                + "; a PNG must hold metres × 256 in 16 bits, a .npy file metres"
-            )
-            raise naming(ValueError(text), "max_distance")
+    def __init__(self, path: str, *, label_map: str | None = None, **common: Any):
+        super().__init__(path, **common)
+        self._opening["label_map"] = label_map

@@ -31,14 +31,14 @@ from darswin.train.finetuning import (
     weights_file,
 )
 from darswin.utils.parameters import check, naming
-from darswin.utils.tasks import Task as TaskName
+from darswin.utils.tasks import Task
 
-__all__ = ["Task"]
+__all__ = ["TaskModule"]
 
 Batch = tuple[Tensor, Lens, Tensor]
 
 
-class Task(LightningModule):
+class TaskModule(LightningModule):
     """Base of the tasks: a model of wide-angle images, its optimiser and its steps.
 
     Subclasses define `_head_options`, `_make_metrics`, `_loss`, `results_figure` and the steps of
@@ -73,7 +73,7 @@ class Task(LightningModule):
         seed: seeds the weights, the jitter, drop path and mixing.
     """
 
-    task: ClassVar[TaskName]
+    task: ClassVar[Task]
     default_model: ClassVar[str]
     monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # the score of the best checkpoint
     results: list[dict[str, Any]]
@@ -150,7 +150,7 @@ class Task(LightningModule):
             raise naming(ValueError(text), "options")
         options |= self.options
         self.card = ModelCard(
-            self.name, options, data.classes, data.size, data.fov, data.frame_fit,
+            self.name, options, data.classes, data.size, data.fov, data.card_fit,
             task=self.task, colors=data.colors,
         )  # fmt: skip
         self.trained = self.card
@@ -265,7 +265,7 @@ class Task(LightningModule):
         theirs, ours = (
             {**card, **card.pop("options")} for card in (asdict(self.trained), asdict(self.card))
         )
-        # A model may be tested on pictures with another framing.
+        # A model may be tested on pictures of another `fit`.
         ignored = {"fit", "colors"} | (set() if theirs["fov"] and ours["fov"] else {"fov"})
         other = [
             f"{key} {theirs.get(key)!r} there, {ours.get(key)!r} here"

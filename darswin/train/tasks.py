@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 from darswin.train.classification import Classification
 from darswin.train.data import RunData, WideAngleData
-from darswin.train.scene_data import DistanceData, LabelData
-from darswin.train.segmentation import Distance, Segmentation
-from darswin.train.task import Task
-from darswin.utils.tasks import Task as TaskName
+from darswin.train.distance import Distance, DistanceData
+from darswin.train.segmentation import LabelData, Segmentation
+from darswin.train.task import TaskModule
+from darswin.utils.tasks import Task
 
 __all__ = ["TASKS"]
 
@@ -15,11 +15,11 @@ __all__ = ["TASKS"]
 class Kind(NamedTuple):
     """The Lightning module of a task, and its data."""
 
-    module: type[Task]
+    module: type[TaskModule]
     data: type[RunData]
 
 
-TASKS: dict[TaskName, Kind] = {
+TASKS: dict[Task, Kind] = {
     "classification": Kind(Classification, WideAngleData),
     "segmentation": Kind(Segmentation, LabelData),
     "distance": Kind(Distance, DistanceData),

@@ -23,7 +23,8 @@ from darswin.cli.answers import (
     label_png,
 )
 from darswin.cli.main import main
-from darswin.data.warping import CutOff, FullSize, at_size
+from darswin.data import FullSize, at_size
+from darswin.data.warping import CutOff
 from darswin.lens import Equidistant, KannalaBrandt, from_dict
 from darswin.lens.pixels import pixel_angles
 from darswin.models.encoder import Encoder, Prepared

@@ -1,19 +1,40 @@
-"""Scenes in which a label and a distance are functions of the ray keep them in every frame."""
+"""A ray stays on the same content, however a sample is cut, resized, turned, mirrored or warped."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from frames import blob, centroid
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 
-from darswin.data import IGNORE, Scene
-from darswin.data.reframing import _points, resize_scene, turn_scene, warp_scene
-from darswin.data.warping import Crop, Turn, taken_part
-from darswin.lens import BrownConrady, Equidistant, OCam, Polynomial, Spherical, load
+from darswin.data import (
+    IGNORE,
+    Moved,
+    RandomTurns,
+    Sample,
+    Turn,
+    Warped,
+    at_size,
+    lens_at_size,
+    reframe,
+)
+from darswin.data.reframing import STILL, Reframing
+from darswin.data.warping import Crop, taken_part
+from darswin.lens import (
+    BrownConrady,
+    Equidistant,
+    KannalaBrandt,
+    OCam,
+    Perspective,
+    Polynomial,
+    Spherical,
+    load,
+)
+from darswin.lens.orientation import upright
 from darswin.lens.pixels import pixel_angles, reprojection
 
 SIZE = (300, 400)
@@ -47,17 +68,27 @@ def scene_of(lens, target="labels"):
     labels = labels_of(theta, azimuth)
     image = np.where(known, 60 + 80 * labels, 0).astype(np.uint8)[..., None]
     if target == "labels":
-        return Scene(image, np.where(known, labels, IGNORE).astype(np.uint8), lens)
-    return Scene(image, np.where(known, distance_of(theta, azimuth), 0).astype(np.float32), lens)
+        return Sample(image, np.where(known, labels, IGNORE).astype(np.uint8), lens)
+    return Sample(image, np.where(known, distance_of(theta, azimuth), 0).astype(np.float32), lens)
 
 
-def before(lens, turn=None):
+def resized(source, taken, size, mirrored=False):
+    return reframe(source, Moved(source.lens, taken, (size, size), Turn(0.0, mirrored)))
+
+
+def turned(source, turn, taken, size):
+    return reframe(source, Moved(source.lens, taken, (size, size), turn))
+
+
+def warped(source, lens, turn=STILL):
+    return reframe(source, Warped(source.lens, lens, turn))
+
+
+def before(lens, turn):
     """The rays of an image's pixels, as they were before a turn; θ is NaN where none is seen."""
     theta, azimuth = rays_of(lens, size_of(lens))
-    if turn is not None:
-        x, y = np.linalg.inv(turn.matrix) @ [np.cos(azimuth).ravel(), np.sin(azimuth).ravel()]
-        azimuth = np.arctan2(y, x).reshape(azimuth.shape)
-    return theta, azimuth
+    x, y = np.linalg.inv(turn.matrix) @ [np.cos(azimuth).ravel(), np.sin(azimuth).ravel()]
+    return theta, np.arctan2(y, x).reshape(azimuth.shape)
 
 
 def shown(source, theta, azimuth, margin):
@@ -80,7 +111,7 @@ def even(labels):
     return same & np.pad(np.ones(np.subtract(labels.shape, 4), bool), 2)
 
 
-def check(scenes, sources, turn=None):
+def check(scenes, sources, turn=STILL):
     """Image, labels, distances and lens agree about every ray that the source showed."""
     theta, azimuth = before(scenes[0].lens, turn)
     certain = shown(sources[0].lens, theta, azimuth, 2.0)
@@ -113,11 +144,11 @@ def test_a_ray_keeps_its_content(name):
         ("crop", Crop(0.8, 1, 0), TURNS[2]),
     ):
         taken = taken_part(sources[0].target.shape, framing, crop)
-        resized = [resize_scene(source, taken, 128, turn.mirrored) for source in sources]
-        check(resized, sources, Turn(0.0, turn.mirrored))
-        check([turn_scene(source, turn, taken, 128) for source in sources], sources, turn)
-    for lens, turn in zip(TARGETS, (None, *TURNS[1:]), strict=True):
-        scenes = [warp_scene(source, lens, 128, turn) for source in sources]
+        scenes = [resized(source, taken, 128, turn.mirrored) for source in sources]
+        check(scenes, sources, Turn(0.0, turn.mirrored))
+        check([turned(source, turn, taken, 128) for source in sources], sources, turn)
+    for lens, turn in zip(TARGETS, (STILL, *TURNS[1:]), strict=True):
+        scenes = [warped(source, lens, turn) for source in sources]
         assert scenes[0].lens is lens
         check(scenes, sources, turn)
 
@@ -138,9 +169,9 @@ def test_image_and_labels_move_together(turn, crop, size, name):
     drawn = Spherical.from_fov(crop.share, 2.4, size * crop.share, center=center)
     drawn = drawn.replace(image_size=torch.tensor([[float(size)] * 2]))
     for scene in (
-        turn_scene(source, turn, taken, size),
-        resize_scene(source, taken, size, turn.mirrored),
-        warp_scene(source, drawn, size, turn),
+        turned(source, turn, taken, size),
+        resized(source, taken, size, turn.mirrored),
+        warped(source, drawn, turn),
     ):
         assert scene.target.shape == (size, size) and size_of(scene.lens) == (size, size)
         inner = even(scene.target) & (scene.target != IGNORE)
@@ -154,11 +185,11 @@ def test_image_and_labels_move_together(turn, crop, size, name):
 def test_the_places_are_those_of_the_exact_reprojection(name):
     height, width = SIZE
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    source = Scene(np.stack((x, y), -1), np.zeros(SIZE, np.float32), LENSES[name])
+    source = Sample(np.stack((x, y), -1), np.zeros(SIZE, np.float32), LENSES[name])
     for lens in TARGETS:
         pair = (source.lens.to(torch.float64), SIZE, lens.to(torch.float64), (128, 128))
         exact = reprojection(*pair)[0]
-        got = torch.from_numpy(warp_scene(source, lens, 128).image)
+        got = torch.from_numpy(warped(source, lens).image)
         inside = ((exact > 2) & (exact < exact.new_tensor([width - 3, height - 3]))).all(-1)
         inside = torch.from_numpy(ndimage.binary_erosion(inside.numpy(), iterations=2))
         # A mean over the pixel, and OpenCV's 1/32 px.
@@ -167,17 +198,181 @@ def test_the_places_are_those_of_the_exact_reprojection(name):
 
 
 def test_what_is_much_larger_is_averaged():
-    assert [_points(scale) for scale in (0.5, 1, 1.5, 2, 4.5, 5, 20)] == [1, 1, 1, 3, 3, 5, 5]
+    one = Equidistant(1.0, 1.5, image_size=(1, 1))
+    points = [Reframing(one, STILL, scale, None)._render for scale in (0.5, 1, 1.5, 2, 4.5, 5, 20)]
+    assert points == [(k, k) for k in (1, 1, 1, 3, 3, 5, 5)]
     lens = Equidistant.from_fov(3.0, 400.0, image_size=(800, 800), center=[399.5, 399.5])
     noise = np.random.default_rng(0).integers(256, size=(800, 800, 1), dtype=np.uint8)
-    source = Scene(noise, np.zeros((800, 800), np.uint8), lens)
+    source = Sample(noise, np.zeros((800, 800), np.uint8), lens)
     small = Equidistant.from_fov(3.0, 40.0, image_size=(80, 80), center=[39.5, 39.5])
     middle = (slice(20, 60), slice(20, 60))
     taken = (0, 0, 800, 800)
-    for scene in (warp_scene(source, small, 80), turn_scene(source, Turn(0.5, False), taken, 80)):
+    for scene in (warped(source, small), turned(source, Turn(0.5, False), taken, 80)):
         # Of 10 × 10 pixels that are read at 5 × 5 points: a sixth of the noise at most.
         assert scene.image[middle].std() < noise.std() / 6
-    assert resize_scene(source, taken, 80, False).image[middle].std() < noise.std() / 9
+    assert resized(source, taken, 80).image[middle].std() < noise.std() / 9
+
+
+def test_the_pixels_beyond_the_view_are_those_of_the_lens():
+    """A lens with tangential terms sees no circle, and in oblong pixels no lens does."""
+    for name, source in SCENES.items():
+        part = 10, 30, 200, 260
+        for turn in (STILL, TURNS[1]):
+            scene = turned(Sample(source.image, source.target * 0, source.lens), turn, part, 97)
+            beyond = np.isnan(pixel_angles(scene.lens, (97, 97))[0].numpy())
+            assert (scene.target[beyond] == IGNORE).all(), name
+            if turn is STILL:
+                known = (scene.target != IGNORE) & ~beyond
+                assert np.array_equal(known, ~beyond) and (beyond.any() or name == "pinhole")
+
+
+# -- points move as the pixels do -------------------------------------------------------------
+
+OBLIQUE = KannalaBrandt(
+    40.0, [0.01], 1.3, [70.0, 60.0], affine=[[1.0, 0.1], [0.0, 0.8]], image_size=(120, 140)
+)
+TANGENTIAL = BrownConrady(
+    60.0, [0.01], 0.8, [75.0, 64.0], tangential=[0.02, -0.03], image_size=(120, 160)
+)
+
+
+def reframings(lens):
+    """All kinds of maps of a lens's pictures."""
+    for turn in (STILL, *TURNS):
+        yield Moved(lens, (20, 10, 150, 210), (60, 90), turn), turn
+        for other in (*TARGETS, OBLIQUE, TANGENTIAL):
+            yield Warped(lens, other, turn), turn
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_points_of_both_pictures_belong_together(name):
+    lens = LENSES[name]
+    azimuth = torch.linspace(-3, 3, 7, dtype=torch.float64)[None]
+    for reframing, turn in reframings(lens):
+        exact = lens.to(torch.float64), reframing.lens.to(torch.float64)
+        rays = torch.stack((azimuth.cos(), azimuth.sin()), -1)
+        for theta in (0.0, 0.2, 0.6):
+            old, new = (
+                one.pixels(torch.full_like(azimuth, theta), ray)[0].numpy()
+                for one, ray in zip(
+                    exact, (rays, rays @ torch.from_numpy(turn.matrix.T)), strict=True
+                )
+            )
+            np.testing.assert_allclose(reframing.to_new(old), new, atol=2e-4)
+            np.testing.assert_allclose(reframing.to_old(new), old, atol=2e-3)
+        if isinstance(reframing, Warped):
+            beyond = np.array([[1e4, 1e4], old[0]])
+            assert np.isnan(reframing.to_new(beyond)).all(-1).tolist() == [True, False]
+            assert np.isnan(reframing.to_old(beyond[:1])).all()
+
+
+@pytest.mark.parametrize("name", [*LENSES, "wide pinhole"])
+def test_pixels_are_read_at_their_points(name):
+    """The tables of a lens's curve are exact to a hundredth of a pixel, to the rim."""
+    wide = Perspective(500.0, math.radians(80), [640.0, 480.0], image_size=(960, 1280))
+    for reframing, _ in reframings(LENSES.get(name, wide)):
+        y, x = (np.linspace(-1, side, 50) for side in reframing.size)
+        places = np.stack(reframing._places(y, x), -1)
+        exact = reframing.to_old(np.stack(np.meshgrid(x, y), -1))
+        seen = ~np.isnan(exact)
+        assert seen.any() and np.abs(places - exact)[seen].max() < 0.013
+        height, width = size_of(LENSES.get(name, wide))
+        away = places[~seen.all(-1)]
+        assert ((away < -1) | (away > [width, height])).any(-1).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_content_moves_to_where_its_point_moves(name):
+    lens = LENSES[name]
+    for theta, azimuth in ((0.3, 0.4), (0.5, 2.5)):
+        at = lens.project_rays(theta, azimuth)[0].numpy()
+        spot = blob(at, size_of(lens), 4.0)
+        for reframing, _ in reframings(lens):
+            there = reframing.to_new(at)
+            if ((there > 12) & (there < np.subtract(reframing.size[::-1], 12))).all():
+                found = centroid(reframing.image(spot)).numpy()
+                np.testing.assert_allclose(found, there, atol=0.5)
+
+
+def test_what_has_no_place_stays_as_it_is():
+    image = np.zeros((*SIZE, 3), np.uint8)
+    lens = LENSES["circle"]
+    for target in (7, None):
+        for reframing in (Moved(lens, (0, 0, 90, 80), (9, 8)), Warped(lens, TARGETS[0])):
+            shown = reframe(Sample(image, target, lens), reframing)
+            assert shown.target is target and shown.lens is reframing.lens
+            assert shown.image.shape == (*reframing.size, 3)
+
+
+def test_a_picture_of_half_the_calibrated_size_gets_the_lens_of_its_size():
+    lens = load(CALIBRATIONS / "woodscape.json")
+    image, there = at_size(np.zeros((483, 640, 1), np.uint8), lens, 64, "stretch")
+    same = lens_at_size(lens.in_picture((483, 640)), 64, "stretch")
+    assert image.shape == (64, 64, 1) and str(there) == str(same)
+    with pytest.raises(ValueError, match=r"1280×966 .* but the picture is 640×500"):
+        at_size(np.zeros((500, 640, 1), np.uint8), lens, 64, "stretch")
+
+
+# -- turned about the optical axis ------------------------------------------------------------
+
+# Oblong and skewed pixels, an off-middle principal point, terms that are not radial.
+SMALL = (120, 160)
+SMALL_LENSES = {
+    "round": Equidistant(60.0, 1.2, image_size=SMALL),
+    "oblong": KannalaBrandt(
+        60.0, [0.01], 1.0, [75.0, 64.0], affine=[[1.0, 0.05], [0.0, 0.9]], image_size=SMALL
+    ),
+    "tangential": BrownConrady(
+        60.0, [0.01], 0.8, [75.0, 64.0], tangential=[0.02, -0.03], image_size=SMALL
+    ),
+    "woodscape": load(CALIBRATIONS / "woodscape.json").in_picture((121, 160)),
+}
+SMALL_TURNS = [Turn(0.0, True), Turn(0.7, False), Turn(math.pi / 2, False), Turn(-2.5, True)]
+
+
+def whole_turned(image, lens, turn):
+    """A picture that keeps its size."""
+    size = image.shape[:2]
+    image, _, lens = reframe(Sample(image, None, lens), Moved(lens, (0, 0, *size), size, turn))
+    return image, lens
+
+
+@pytest.mark.parametrize("turn", SMALL_TURNS)
+@pytest.mark.parametrize("name", SMALL_LENSES)
+def test_a_ray_stays_on_its_content_after_a_turn(name, turn):
+    lens = SMALL_LENSES[name]
+    size = tuple(int(side) for side in lens.image_size[0])
+    for theta, azimuth in ((0.3, 0.5), (0.5, -1.0), (0.4, 2.5)):
+        before = blob(lens.project_rays(theta, azimuth)[0], size, 3.0)
+        image, after = whole_turned(before, lens, turn)
+        assert image.shape == (*size, 1) and tuple(after.image_size[0].tolist()) == size
+        across = torch.tensor([math.cos(azimuth), math.sin(azimuth)], dtype=torch.float64)
+        seen = torch.from_numpy(turn.matrix) @ across
+        there = after.project_rays(theta, math.atan2(seen[1], seen[0]))[0]
+        torch.testing.assert_close(centroid(image), there, atol=0.15, rtol=0)
+
+
+def test_only_what_must_turn_with_a_picture_does():
+    image = np.random.default_rng(0).integers(256, size=(*SMALL, 3), dtype=np.uint8)
+    for name, changes in (("oblong", False), ("tangential", True)):
+        lens = whole_turned(image, SMALL_LENSES[name], SMALL_TURNS[1])[1]
+        assert (str(lens) != str(SMALL_LENSES[name])) == changes
+    mirrored, lens = whole_turned(image, SMALL_LENSES["oblong"], SMALL_TURNS[0])
+    assert (mirrored == image[:, ::-1]).all() and str(lens) == str(
+        upright(SMALL_LENSES["oblong"], 2)
+    )
+
+
+def test_how_turns_are_drawn():
+    rng = np.random.default_rng(0)
+    turns = [RandomTurns(True, 30).draw(rng) for _ in range(2000)]
+    angles = np.degrees([turn.angle for turn in turns])
+    assert np.abs(angles).max() <= 30 and np.abs(angles.std() - 30 / math.sqrt(3)) < 0.5
+    assert abs(angles.mean()) < 2 and 0.45 < np.mean([turn.mirrored for turn in turns]) < 0.55
+    assert RandomTurns(False, 0).draw(rng) == (0.0, False)
+    for angle in (-1, 181, math.nan):
+        with pytest.raises(ValueError, match=r"`rotate_deg` must be in \[0, 180\]"):
+            RandomTurns(rotate_deg=angle)
 
 
 # -- targets are not shifted ------------------------------------------------------------------
@@ -187,14 +382,14 @@ def ramp(size, axis=0, dtype=np.float32):
     """A scene whose image is x + 1 and y + 1, and whose target is one of them."""
     y, x = np.mgrid[: size[0], : size[1]].astype(np.float32) + 1
     lens = Equidistant(max(size), 2.5, (size[1] / 2 - 0.5, size[0] / 2 - 0.5), image_size=size)
-    return Scene(np.stack((x, y), -1), (x, y)[axis].astype(dtype), lens)
+    return Sample(np.stack((x, y), -1), (x, y)[axis].astype(dtype), lens)
 
 
 def smaller(source, taken, size):
     """A lens of the same model, through which the picture becomes `size` px wide."""
     focal = source.lens.focal.item() * size / taken[3]
     lens = Equidistant(focal, 0.8, (size / 2 - 0.5, size / 2 - 0.5), image_size=(size, size))
-    return warp_scene(source, lens, size)
+    return warped(source, lens)
 
 
 SIZES = [
@@ -203,10 +398,10 @@ SIZES = [
     ((60, 250), 120), ((90, 640), 128), ((480, 80), 160), ((128, 128), 128),
 ]  # fmt: skip
 FRAMES = {
-    "resized": lambda *scene: resize_scene(*scene, mirrored=False),
-    "mirrored": lambda *scene: resize_scene(*scene, mirrored=True),
-    "upside down": lambda source, *taken: turn_scene(source, Turn(math.pi, False), *taken),
-    "turned": lambda source, *taken: turn_scene(source, Turn(0.3, True), *taken),
+    "resized": resized,
+    "mirrored": lambda *scene: resized(*scene, mirrored=True),
+    "upside down": lambda source, *taken: turned(source, Turn(math.pi, False), *taken),
+    "turned": lambda source, *taken: turned(source, Turn(0.3, True), *taken),
     "smaller": smaller,
 }
 
@@ -236,7 +431,7 @@ def test_targets_are_not_shifted(whole, size, frame):
 @pytest.mark.parametrize(("whole", "size"), SIZES)
 def test_a_mirrored_picture_has_mirrored_targets(whole, size):
     taken = 0, 0, *whole
-    plain, mirrored = (resize_scene(ramp(whole), taken, size, m).target for m in (False, True))
+    plain, mirrored = (resized(ramp(whole), taken, size, m).target for m in (False, True))
     same = plain[:, ::-1] == mirrored
     same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
     assert same.all()

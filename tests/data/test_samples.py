@@ -23,11 +23,12 @@ from darswin.data import (
     at_size,
     open_scenes,
     open_source,
-    warp,
+    warp_map,
 )
 from darswin.data.order import TrainingOrder
 from darswin.data.pictures import Arrays
 from darswin.data.samples import Draw
+from darswin.data.warping import remap
 from darswin.lens import Equidistant, Spherical, Tabulated, load
 from darswin.lens.orientation import in_upright_picture
 from darswin.utils.image import BrokenImageError, read_oriented
@@ -162,17 +163,17 @@ def test_a_picture_that_cannot_be_read(folders, name):
         torch.testing.assert_close(lenses[1].project(0.5), lens.project(0.5), rtol=0.01, atol=0)
 
 
-def test_unknown_framings(folders):
-    with pytest.raises(ValueError, match="framing must be 'crop' or 'stretch', got 'whole'"):
-        DATASETS["wide"](folders, framing="whole")
+def test_unknown_fits(folders):
+    with pytest.raises(ValueError, match="`fit` must be 'crop' or 'stretch', got 'whole'"):
+        DATASETS["wide"](folders, fit="whole")
 
 
 @pytest.mark.parametrize("name", DATASETS)
 def test_by_default_pictures_with_a_lens_are_kept_whole(folders, name):
-    dataset, cropped = DATASETS[name](folders), DATASETS[name](folders, framing="crop")
+    dataset, cropped = DATASETS[name](folders), DATASETS[name](folders, fit="crop")
     calibrated = "wide" not in name
-    assert dataset.framing == ("stretch" if calibrated else "crop")
-    assert DATASETS[name](folders, framing="stretch").cut_off() is None
+    assert dataset.fit == ("stretch" if calibrated else "crop")
+    assert DATASETS[name](folders, fit="stretch").cut_off() is None
     lost = cropped.cut_off()
     assert (dataset.cut_off() is None) == calibrated
     assert lost.startswith("19 px at the left and 20 px at the right of pictures of 160×121 px")
@@ -182,12 +183,12 @@ def test_by_default_pictures_with_a_lens_are_kept_whole(folders, name):
 # -- calibrated pictures ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("framing", ["crop", "stretch"])
-def test_a_sample_is_the_picture_at_the_size_with_its_lens(folders, framing):
-    dataset = Calibrated(frames(folders), Calibrations(WOODSCAPE), framing=framing, **GREY)
+@pytest.mark.parametrize("fit", ["crop", "stretch"])
+def test_a_sample_is_the_picture_at_the_size_with_its_lens(folders, fit):
+    dataset = Calibrated(frames(folders), Calibrations(WOODSCAPE), fit=fit, **GREY)
     image, lens, label = dataset[3]
     picture = cv2.imread(str(dataset.source.file(3)), cv2.IMREAD_GRAYSCALE)[..., None]
-    expected, there = at_size(picture, load(WOODSCAPE).in_picture(picture.shape[:2]), 24, framing)
+    expected, there = at_size(picture, load(WOODSCAPE).in_picture(picture.shape[:2]), 24, fit)
     assert image.shape == (1, 24, 24) and image.dtype == torch.float32
     np.testing.assert_allclose(255 * image[0].numpy(), expected[..., 0], atol=1e-3)
     assert str(lens) == str(there) and label == int(dataset.source.file(3).parent.name)
@@ -215,8 +216,9 @@ def test_a_picture_as_another_lens_had_seen_it(folders):
     picture = dataset.source[3][0]
     assert label == dataset.source[3][1] and isinstance(lens, Spherical)
     assert lens.theta_max.item() == pytest.approx(own.theta_max.item(), rel=1e-5)
-    large = warp(picture, own.in_picture(picture.shape[:2]), lens.resized((192, 192)), (192, 192))
-    expected = cv2.resize(large, (24, 24), interpolation=cv2.INTER_AREA)
+    own = own.in_picture(picture.shape[:2])
+    (places,) = warp_map(own, picture.shape[:2], lens.resized((192, 192)), (192, 192))
+    expected = cv2.resize(remap(picture, places), (24, 24), interpolation=cv2.INTER_AREA)
     assert np.abs(255 * image[0].numpy() - expected).mean() < 3
     assert str(dataset[Draw(1, 3, 3)][1]) != str(lens)  # another lens in each epoch
 

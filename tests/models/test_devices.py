@@ -14,7 +14,8 @@ from darswin import lens
 from darswin.lens import cat, distorted, solve
 from darswin.models import create_model
 from darswin.train.classification import Classification
-from darswin.train.segmentation import Distance, Segmentation
+from darswin.train.distance import Distance
+from darswin.train.segmentation import Segmentation
 
 SPHERICAL = lens.Spherical.from_fov(xi=[0.3, 0.5], fov=2.0, radius=32.0)
 LENSES = {

@@ -13,7 +13,8 @@ from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
 from darswin.cli.predict import predict
-from darswin.data.warping import at_size, remap, warp_map
+from darswin.data import at_size, warp_map
+from darswin.data.warping import remap
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin.ops import (
-    polar_embed,
     polar_sample,
     polar_to_image,
     polar_to_image_plan,
@@ -222,29 +221,22 @@ def sampling_call(
     inputs: dict[str, Tensor], azimuths: Tensor, samples: tuple[int, int], layout: str = "tokens",
     jitter: float = 0.0, seed: int = 0, **others,
 ) -> Case:  # fmt: skip
-    """A call of polar_sample, or of polar_embed if the inputs have a weight."""
-    embed, channels = "weight" in inputs, inputs["image"].shape[1]
-    options = dict(samples=samples, jitter=jitter, seed=seed)
-    if not embed:
-        options["layout"] = layout
+    """A call of polar_sample."""
+    options = dict(samples=samples, jitter=jitter, seed=seed, layout=layout)
     settings = options | dict(azimuths=azimuths)
 
-    def run(image, radii, center, weight=None, bias=None, **general):
-        grid = (image, radii, settings["azimuths"].to(radii), center)
-        if embed:
-            return polar_embed(*grid, weight, bias, **general, **options, **others)
-        return polar_sample(*grid, **general, **options, **others)
+    def run(image, radii, center, **general):
+        azimuths = settings["azimuths"].to(radii)
+        return polar_sample(image, radii, azimuths, center, **general, **options, **others)
 
-    def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
+    def mask(image, radii, center, affine=None, offsets=None):
         """0 where gradients jump: at borders of pixels, and where jitter clamps the radius to 0."""
         grid = (radii, settings["azimuths"], center, affine, offsets)
         x, y, r = places(*grid, len(image), jitter, seed)
         smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
         if jitter > 0:
             smooth &= r > 1e-3
-        if embed:  # a token gets a gradient only if all its samples are smooth
-            return to_tokens(smooth[:, None].to(f64), samples).amin(-1, keepdim=True)
-        planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
+        planes = smooth[:, None].expand(-1, image.shape[1], -1, -1).to(f64)
         return planes if layout == "image" else to_tokens(planes, samples)
 
     return Case(run, inputs, mask, settings)
@@ -252,11 +244,11 @@ def sampling_call(
 
 def sampling(
     batch=2, channels=3, size=(17, 23), rows=6, columns=8, samples=(3, 4), shared=False,
-    affine=False, offsets=False, far=1.0, features=None, bias=True, dtype=f32, **options,
+    affine=False, offsets=False, far=1.0, dtype=f32, **options,
 ) -> Case:  # fmt: skip
-    """polar_sample, or polar_embed if `features` is given, with points inside, on the border and
-    outside. The matrix more than doubles some lengths. Offsets are about `far` px, and one in ten
-    is about the image's size times larger."""
+    """polar_sample, with points inside, on the border and outside. The matrix more than doubles
+    some lengths. Offsets are about `far` px, and one in ten is about the image's size times
+    larger."""
     lenses, reach = 1 if shared else batch, max(size)
     center = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
     inputs = dict(
@@ -270,11 +262,6 @@ def sampling(
         moves = far * torch.randn(lenses, 2, rows, columns, dtype=dtype)
         jumps = torch.rand(lenses, 1, rows, columns) < 0.1
         inputs["offsets"] = torch.where(jumps, moves * reach, moves)
-    if features is not None:
-        depth = samples[0] * samples[1] * channels
-        inputs["weight"] = torch.randn(features, depth, dtype=dtype) / math.sqrt(depth or 1)
-        if bias:
-            inputs["bias"] = torch.randn(features, dtype=dtype)
     azimuths = (torch.arange(columns, dtype=f64) + 0.37) * (2 * math.pi / max(columns, 1))
     return sampling_call(inputs, azimuths.to(dtype), samples, **options)
 
@@ -352,7 +339,7 @@ def polar_map(
 
 # -- named cases -----------------------------------------------------------------------------------
 
-NEAR = dict(size=(31, 33), rows=40, columns=64)
+PACKED = dict(size=(31, 33), rows=40, columns=64)
 # For many tokens per block, and for tokens of a single row.
 FEW = dict(size=(40, 42), rows=8, batch=1)
 SAMPLING = {
@@ -370,17 +357,17 @@ SAMPLING = {
     "no points": dict(rows=0),
     "no channels": dict(channels=0),
     # Cases for which csrc/kernels takes different paths.
-    "cells": NEAR | dict(samples=(10, 8)),
-    "cells, one channel": NEAR | dict(columns=63, channels=1, samples=(8, 3)),
-    "cells, two channels": NEAR | dict(channels=2, samples=(4, 4)),
-    "cells, four channels": NEAR | dict(channels=4, batch=1, samples=(4, 4)),
-    "packed, six channels": NEAR | dict(channels=6, samples=(4, 4)),
+    "cells": PACKED | dict(samples=(10, 8)),
+    "cells, one channel": PACKED | dict(columns=63, channels=1, samples=(8, 3)),
+    "cells, two channels": PACKED | dict(channels=2, samples=(4, 4)),
+    "cells, four channels": PACKED | dict(channels=4, batch=1, samples=(4, 4)),
+    "packed, six channels": PACKED | dict(channels=6, samples=(4, 4)),
     "packed, 64 channels": dict(size=(16, 17), rows=20, columns=32, channels=64, batch=1,
                                 samples=(4, 4)),
     "packed, large": dict(size=(200, 180), rows=80, columns=160, batch=1, samples=(8, 8)),
-    "in place": dict(size=(200, 180), rows=8, columns=16, samples=(4, 4)),
-    "in place, large": dict(size=(400, 390), rows=20, columns=16, batch=1, samples=(4, 4)),
-    "in place, shared": dict(size=(90, 80), rows=8, columns=15, shared=True, samples=(4, 5)),
+    "direct": dict(size=(200, 180), rows=8, columns=16, samples=(4, 4)),
+    "direct, large": dict(size=(400, 390), rows=20, columns=16, batch=1, samples=(4, 4)),
+    "direct, shared": dict(size=(90, 80), rows=8, columns=15, shared=True, samples=(4, 5)),
     "many tokens": dict(size=(31, 33), rows=80, columns=640, batch=1, samples=(10, 10)),
     "long rows": dict(size=(31, 33), rows=2, columns=3001, batch=1, samples=(1, 3001)),
     "two points a token": FEW | dict(columns=600, samples=(1, 2)),
@@ -394,27 +381,6 @@ SAMPLING_WITH = {
     "affine": dict(affine=True, layout="image"),
     "offsets": dict(offsets=True, jitter=0.8, seed=3),
     "general": dict(affine=True, offsets=True, jitter=0.8, seed=-5),
-}
-EMBEDDING = {
-    "plain": dict(size=(31, 33), rows=12, columns=40, samples=(4, 5), features=20),
-    "no bias": dict(features=20, bias=False),
-    "paper": dict(size=(64, 66), rows=20, columns=640, samples=(10, 10), features=96, batch=1),
-    "one token": dict(rows=1, columns=1, samples=(1, 1), features=1, channels=1),
-    "odd": dict(size=(31, 33), rows=9, columns=21, samples=(3, 3), features=37, channels=2),
-    "many features": dict(rows=12, columns=25, samples=(4, 5), features=200),
-    "deep": dict(rows=36, columns=36, samples=(12, 12), features=50, channels=4),
-    "six channels": NEAR | dict(samples=(4, 4), channels=6, features=48),
-    "large image": dict(size=(300, 302), rows=8, columns=20, samples=(4, 5), features=20),
-    "shared lens": dict(batch=5, shared=True, samples=(2, 2), features=20),
-    "empty batch": dict(batch=0, features=20),
-    "no rings": dict(rows=0, features=20),
-    "no azimuths": dict(columns=0, features=20),
-    "no channels": dict(channels=0, features=20),
-    "no features": dict(features=0),
-}
-EMBEDDING_WITH = {
-    "circular": dict(),
-    "general": dict(affine=True, offsets=True, jitter=0.8, seed=3),
 }
 ATTENTION = {
     "DarSwin-A stage 1": dict(rings=3, sectors=64, head_dim=32, window=(1, 16), shift=(0, 4)),
@@ -460,12 +426,9 @@ MAPS = {
 
 # (operator, name) → a function that makes the case in a dtype.
 CASES: dict[tuple[str, str], Callable[..., Case]] = {}
-for table, variants, operator in (
-    (SAMPLING, SAMPLING_WITH, "polar_sample"), (EMBEDDING, EMBEDDING_WITH, "polar_embed"),
-):  # fmt: skip
-    for name, sizes in table.items():
-        for variant, more in variants.items():
-            CASES[operator, f"{name}, {variant}"] = functools.partial(sampling, **sizes, **more)
+for name, sizes in SAMPLING.items():
+    for variant, more in SAMPLING_WITH.items():
+        CASES["polar_sample", f"{name}, {variant}"] = functools.partial(sampling, **sizes, **more)
 for name, sizes in ATTENTION.items():
     CASES["window_attention", name] = functools.partial(attention, **sizes)
 for name, sizes in MAPS.items():
@@ -480,9 +443,6 @@ SMALL = {
     for name, make, sizes, options in (
         ("polar_sample", sampling, GRID, dict(affine=True, offsets=True, jitter=0.6, seed=11)),
         ("polar_sample, circular", sampling, GRID, dict(layout="image")),
-        ("polar_embed", sampling, GRID,
-         dict(features=3, affine=True, offsets=True, jitter=0.5, seed=1)),
-        ("polar_embed, circular", sampling, GRID, dict(features=3, bias=False)),
         ("window_attention", attention, WINDOWS, dict()),
         ("window_attention, a bias an image", attention, WINDOWS,
          dict(periodic=(False, False), bias_rows=2, scale=0.7)),

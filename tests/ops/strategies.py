@@ -67,18 +67,15 @@ def grids(draw):
 
 
 @st.composite
-def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
-    """A call of polar_sample, or of polar_embed."""
+def sampling(draw, dtypes=(f32, f64)) -> Case:
+    """A call of polar_sample."""
     torch.manual_seed(draw(st.integers(0, 2**31)))
     rings, sectors, samples = draw(grids())
     pairs = st.tuples(*[sizes(0, 1, 2, 7, 16, 33, 90)] * 2)
     options = dict(
-        jitter=draw(sizes(0.0, 0.0, 1.0, 0.3)), seed=draw(st.integers(-(2**63), 2**63 - 1))
-    )
-    if embed:
-        options |= dict(features=draw(sizes(0, 1, 2, 15, 16, 17, 48)), bias=draw(st.booleans()))
-    else:
-        options |= dict(layout=draw(sizes("tokens", "image")))
+        jitter=draw(sizes(0.0, 0.0, 1.0, 0.3)), seed=draw(st.integers(-(2**63), 2**63 - 1)),
+        layout=draw(sizes("tokens", "image")),
+    )  # fmt: skip
     case = cases.sampling(
         draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17)), draw(pairs),
         rings * samples[0], sectors * samples[1], samples, shared=draw(st.booleans()),
@@ -94,8 +91,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
         settings["azimuths"] = 1e6 * torch.randn_like(settings["azimuths"])
     settings["azimuths"] = draw(strided(settings["azimuths"]))
     for name, tensor in inputs.items():
-        of_all = name in ("image", "weight", "bias")
-        inputs[name] = draw(strided(tensor) if of_all else of_lens(tensor))
+        inputs[name] = draw(strided(tensor) if name == "image" else of_lens(tensor))
     return case
 
 

@@ -13,7 +13,8 @@ from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
 
-_norm, _linear = torch.ops.darswin._norm, torch.ops.darswin._linear
+_OPS = torch.ops.darswin
+_norm, _linear, _pack_linear = _OPS._norm, _OPS._linear, _OPS._pack_linear
 # Rows, depth, columns: less than a tile, a tile and a remainder, one and several panels, one and
 # several parts of the depth, the sizes of the models, and no rows.
 SIZES = [(1, 1, 1), (3, 5, 7), (9, 24, 72), (64, 48, 192), (33, 129, 50), (16, 384, 96),
@@ -164,6 +165,29 @@ def test_same_bits_on_any_number_of_threads():
         ),
         (1, 2, 5),
     )  # fmt: skip
+
+
+def test_packing_reads_any_strides():
+    linear = layer(37, 50)
+    weight, bias = linear.weight.t().contiguous().t(), torch.stack((linear.bias,) * 2, 1)[:, 0]
+    assert not weight.is_contiguous() and not bias.is_contiguous()
+    assert torch.equal(_pack_linear(weight, bias), packed_weights(linear))
+
+
+def test_packing_refuses_wrong_arguments():
+    weight, bias = torch.zeros(5, 6), torch.zeros(5)
+    bytes_, scales, huge = weight.char(), torch.ones(5), torch.zeros(1, 1).expand(2**31, 2**31)
+    for given in (
+        (weight.double(), bias), (weight[0], bias), (weight, bias[:4]), (weight, bias.double()),
+        (weight.to("meta"), bias), (weight, bias.to("meta")), (bytes_, bias), (huge, None),
+        (weight, bias, scales), (bytes_, bias, scales[:4]), (bytes_, bias, scales.double()),
+        (bytes_, bias[:4], scales), (bytes_, bias, scales, 0.0), (bytes_, bias, scales, math.nan),
+        (bytes_, bias, scales, 0.1, -1), (bytes_, bias, scales, 0.1, 256),
+    ):  # fmt: skip
+        with pytest.raises(RuntimeError):
+            _pack_linear(*given)
+    for empty in (torch.zeros(0, 6), torch.zeros(5, 0)):
+        assert not _pack_linear(empty, None).any()
 
 
 def test_wrong_arguments():

@@ -8,7 +8,7 @@ import torch
 from cases import SMALL, raw_calls
 from torch._subclasses import FakeTensorMode
 
-from darswin.ops import polar_embed, polar_sample, polar_to_image, use_reference, window_attention
+from darswin.ops import polar_sample, polar_to_image, use_reference, window_attention
 
 zeros, ones = torch.zeros, torch.ones
 GRID = dict(
@@ -17,7 +17,6 @@ GRID = dict(
 )  # fmt: skip
 VALID = {
     "polar_sample": (polar_sample, GRID),
-    "polar_embed": (polar_embed, GRID | dict(weight=ones(20, 36), bias=ones(20))),
     "window_attention": (
         window_attention, dict(qkv=ones(2, 4, 8, 3, 2, 5), bias=ones(1, 2, 3, 7), window=(2, 4)),
     ),
@@ -74,12 +73,6 @@ SAMPLING = [
 ]  # fmt: skip
 WRONG = {
     "polar_sample": [*SAMPLING, (dict(layout="planes"), ValueError, "layout must be one of")],
-    "polar_embed": [
-        *SAMPLING,
-        (dict(weight=zeros(20, 37)), ValueError, r"weight must have shape .*\(any, 36\)"),
-        (dict(weight=zeros(20, 36).double()), TypeError, "weight must be float32 or bfloat16"),
-        (dict(bias=zeros(21)), ValueError, r"bias must have shape \(D,\) = \(20,\), got"),
-    ],
     "window_attention": [
         (dict(qkv=None), TypeError, "qkv must be a tensor, got NoneType"),
         (dict(qkv=zeros(2, 4, 8, 30)), ValueError, r"3, heads, d\), got \(2, 4, 8, 30\)"),
@@ -171,23 +164,18 @@ def test_a_radius_of_zero_is_allowed():
 
 # -- past the public functions ---------------------------------------------------------------------
 
-SAMPLING_RAW = {
-    "image": [zeros(3), zeros(1, 3, 7, 8), zeros(2, 3, 7, 8).double()],
-    "radii": [zeros(3, 4), zeros(2, 4).double()],
-    "center": [zeros(1, 1), zeros(3, 2)],
-    "affine": [zeros(2, 2), zeros(3, 2, 2), zeros(2, 2, 2).double(), torch.tensor(1.0)],
-    "offsets": [zeros(2, 1, 4, 6), zeros(2, 2, 3, 6), zeros(2, 2, 4, 5), zeros(3, 2, 4, 6),
-                zeros(2, 2, 4, 6).double()],
-    "samples": [(0, 3), (2, 4), (3, 3), (2,)],
-    "jitter": [torch.tensor(0.5), *(torch.tensor(bad, dtype=torch.float64)
-                                    for bad in (1e300, -0.1, 1.5, math.nan, math.inf))],
-    "seed": [None, torch.tensor(1.0)],
-}  # fmt: skip
 RAW = {
-    "polar_sample": SAMPLING_RAW,
-    "polar_embed": SAMPLING_RAW | {
-        "weight": [zeros(3, 17), zeros(18), zeros(3, 18).double()],
-        "bias": [zeros(2)],
+    "polar_sample": {
+        "image": [zeros(3), zeros(1, 3, 7, 8), zeros(2, 3, 7, 8).double()],
+        "radii": [zeros(3, 4), zeros(2, 4).double()],
+        "center": [zeros(1, 1), zeros(3, 2)],
+        "affine": [zeros(2, 2), zeros(3, 2, 2), zeros(2, 2, 2).double(), torch.tensor(1.0)],
+        "offsets": [zeros(2, 1, 4, 6), zeros(2, 2, 3, 6), zeros(2, 2, 4, 5), zeros(3, 2, 4, 6),
+                    zeros(2, 2, 4, 6).double()],
+        "samples": [(0, 3), (2, 4), (3, 3), (2,)],
+        "jitter": [torch.tensor(0.5), *(torch.tensor(bad, dtype=torch.float64)
+                                        for bad in (1e300, -0.1, 1.5, math.nan, math.inf))],
+        "seed": [None, torch.tensor(1.0)],
     },
     "window_attention": {
         "qkv": [zeros(3)], "bias": [zeros(1, 2, 3, 3), zeros(3, 2, 3, 7)],

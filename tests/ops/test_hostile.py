@@ -39,7 +39,7 @@ def valid(name: str) -> list:
     return [a.detach() if isinstance(a, Tensor) else a for a in arguments]
 
 
-PUBLIC = ("polar_sample", "polar_embed", "window_attention", "polar_to_image")
+PUBLIC = ("polar_sample", "window_attention", "polar_to_image")
 PRIVATE = ("_add_norm_", "_polar_to_image_plan")
 NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), *PRIVATE]
 

@@ -14,7 +14,6 @@ from torch.func import vmap
 
 from darswin import ops
 from darswin.ops import (
-    polar_embed,
     polar_sample,
     polar_to_image,
     reference,
@@ -23,7 +22,7 @@ from darswin.ops import (
     window_attention,
 )
 
-image, radii, center, weight = SMALL["polar_embed, circular"]().inputs.values()
+image, radii, center = SMALL["polar_sample, circular"]().inputs.values()
 azimuths, samples = torch.linspace(0, 6, 6), (2, 3)
 qkv, bias = attention().inputs.values()
 ring_centers, middle = radii[:1], center[:1]
@@ -31,9 +30,6 @@ ring_centers, middle = radii[:1], center[:1]
 # For each operator, a function of one tensor and this tensor.
 CALLS = {
     "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, samples=samples), image),
-    "polar_embed": (
-        lambda x: polar_embed(image, radii, azimuths, center, x, samples=samples), weight,
-    ),
     "polar_to_image": (
         lambda x: polar_to_image(x, ring_centers, middle, (7, 8)), torch.randn(2, 4, 8, 3),
     ),
@@ -174,31 +170,27 @@ def test_backward_has_none_of_them_either(name):
 # -- only the reference has a gradient for azimuths ------------------------------------------------
 
 
-def of_azimuths(embed, jitter, dtype=f32):
+def of_azimuths(jitter, dtype=f32):
     """The sampling as a function of its azimuths."""
-    pixels, *lens, layer = (t.to(dtype) for t in (image, radii, center, weight))
+    pixels, *lens = (t.to(dtype) for t in (image, radii, center))
     options = dict(samples=samples, jitter=jitter, seed=3)
-    if embed:
-        return lambda angles: polar_embed(pixels, lens[0], angles, lens[1], layer, **options)
     return lambda angles: polar_sample(pixels, lens[0], angles, lens[1], **options)
 
 
-@pytest.mark.parametrize("embed", [False, True])
-def test_azimuths_that_require_a_gradient_are_refused(embed):
-    run, wanted = of_azimuths(embed, 0.5), azimuths.clone().requires_grad_()
+def test_azimuths_that_require_a_gradient_are_refused():
+    run, wanted = of_azimuths(0.5), azimuths.clone().requires_grad_()
     with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
         run(wanted)
     with torch.no_grad():
         assert torch.equal(run(wanted), run(azimuths))
     with use_reference():
-        run = of_azimuths(embed, 0.5, f64)
+        run = of_azimuths(0.5, f64)
         assert torch.autograd.gradcheck(run, azimuths.double().requires_grad_())
 
 
 @compiles
-@pytest.mark.parametrize("embed", [False, True])
-def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(embed):
-    compiled = torch.compile(of_azimuths(embed, 0.5), backend="eager")
+def test_a_compiled_function_refuses_azimuths_that_require_a_gradient():
+    compiled = torch.compile(of_azimuths(0.5), backend="eager")
     with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
         compiled(azimuths.clone().requires_grad_())
 

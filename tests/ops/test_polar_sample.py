@@ -1,5 +1,4 @@
-"""Tests beyond the contract: positions of polar_sample's points, values of its pixels, and
-polar_embed compared with its two steps."""
+"""Tests beyond the contract: positions of polar_sample's points, and values of its pixels."""
 
 import math
 
@@ -18,7 +17,7 @@ from cases import (
 )
 from torch._dynamo.testing import CompileCounter
 
-from darswin.ops import polar_embed, polar_sample, use_reference
+from darswin.ops import polar_sample, use_reference
 from darswin.ops.reference import philox
 
 references = pytest.mark.parametrize("reference", [False, True])
@@ -93,11 +92,31 @@ def test_sizes_beyond_two_to_the_31():
     assert out.flatten().tolist() == [1.0, 1.0, 0.0]
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("dtype", [f32, f64, torch.bfloat16, torch.uint8], ids=str)
+def test_a_sample_does_not_depend_on_other_points_or_pixels(dtype, channels):
+    """Many points are read from a packed copy and few directly, with the same bits."""
+    case = sampling(2, channels, (33, 40), 24, 60, (1, 60), layout="image", mean=0.3, std=0.2,
+                    channels_last=False).to(f64 if dtype == f64 else f32)  # fmt: skip
+    image, radii, center = case.inputs.values()
+    image = (100 + 40 * image).clamp(0, 255).to(dtype)
+    out = case.run(image, radii, center)
+    assert out.any() and not out.all()  # some points lie outside
+    for i in range(radii.shape[1]):
+        assert torch.equal(case.run(image, radii[:, i : i + 1], center), out[:, :, i : i + 1])
+    one = torch.zeros_like(image, dtype=radii.dtype)
+    one[..., 9, 12] = 1
+    touched = case.run(one, radii, center) != 0
+    image[..., 9, 12] = 255 if dtype == torch.uint8 else math.inf
+    changed = case.run(image, radii, center) != out
+    assert touched.any() and torch.equal(changed, touched)
+
+
 # -- NaN and infinity ------------------------------------------------------------------------------
 
 
 @jitters
-@pytest.mark.parametrize("rows", [1, 3])  # a far image, and a near one, which is packed
+@pytest.mark.parametrize("rows", [1, 3])  # an image that is read directly, and a packed one
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_points_at_nan_or_infinity_sample_nothing(bad, rows, jitter):
     # Another input is bad in each image, and one azimuth is bad in all images.
@@ -215,14 +234,13 @@ def test_bfloat16_rounds_to_nearest_even_and_keeps_nan():
         torch.testing.assert_close(out, expected, rtol=0, atol=0, equal_nan=True)
 
 
-@pytest.mark.parametrize("columns", [28, 40])  # far and near
-@pytest.mark.parametrize("features", [None, 20])
+@pytest.mark.parametrize("columns", [28, 40])  # read directly, and packed
 @pytest.mark.parametrize("form", ["planes", "frames", "permuted"])
-def test_uint8_pixels_are_what_they_stand_for(form, features, columns):
+def test_uint8_pixels_are_what_they_stand_for(form, columns):
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     norm = dict(mean=mean.tolist(), std=std.tolist(), channels_last=form == "frames")
     options = norm | GENERAL | dict(jitter=0.8, seed=2)
-    case = sampling(rows=3, columns=columns, features=features, **options)
+    case = sampling(rows=3, columns=columns, **options)
     frames = torch.randint(256, (2, 17, 23, 3), dtype=torch.uint8)
     planes = frames.permute(0, 3, 1, 2)
     raw = case.replace(image=dict(planes=planes.contiguous(), frames=frames, permuted=planes)[form])
@@ -303,7 +321,7 @@ def test_one_graph_for_uint8_images_of_any_size(last):
     [(9, 6, 12), (40, 8, 1031), (40, 1, 2500), (700, 12, 90), (9, 7, 1)],
 )
 def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
-    """Covers near and far images, rows longer than a block, and rows of prime length."""
+    """Covers packed images and others, rows longer than a block, and rows of prime length."""
     arguments = grid((size, size), rows, columns)
     options = dict(layout="image", jitter=1.0, seed=3)
     sampled = [
@@ -337,9 +355,9 @@ def test_a_token_longer_than_a_block_ends_where_it_ends(channels, dtype, columns
 @pytest.mark.parametrize("dtype", [f32, torch.bfloat16, torch.uint8])
 @pytest.mark.parametrize("samples", [(4, 5), (3, 2), (1, 1), (6, 40)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
-def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
+def test_the_layout_of_an_image_that_is_read_directly_does_not_matter(channels, samples, dtype):
     """Compares planes, pixels with adjacent channels, both with gaps, and transposed planes."""
-    size = 150  # a far image has more than four pixels for each of the 24 x 120 points
+    size = 150  # read directly: more than four pixels for each of the 24 x 120 points
     image = (torch.rand(2, channels, size, size) * 255).to(dtype)
     radii = torch.stack((torch.linspace(0, 75, 24), torch.linspace(10, 90, 24)))
     lens = (radii, torch.linspace(0, 6.2, 120), torch.full((1, 2), 74.5))
@@ -359,27 +377,3 @@ def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
         torch.testing.assert_close(planes, expected, rtol=1e-2, atol=0.05)
         for name, other in others.items():
             assert torch.equal(polar_sample(other, *lens, **options), planes), name
-
-
-# -- polar_embed -----------------------------------------------------------------------------------
-
-
-def test_gradients_of_very_many_tokens_are_as_accurate_as_torch():
-    # For 131,072 tokens, plain float32 sums had 12 times the error of torch.
-    radii, azimuths = torch.linspace(1, 6, 64)[None], torch.linspace(0, 6.2, 512)
-    image, center = torch.randn(4, 1, 12, 12), torch.full((1, 2), 5.5)
-    grad = torch.randn(4, 64, 512, 3) + 0.5
-
-    def gradients(dtype):
-        weight = torch.ones(3, 1, dtype=dtype, requires_grad=True)
-        bias = torch.zeros(3, dtype=dtype, requires_grad=True)
-        lens = (t.to(dtype) for t in (image, radii, azimuths, center))
-        out = polar_embed(*lens, weight, bias, samples=(1, 1))
-        return torch.autograd.grad(out, (weight, bias), grad.to(dtype))
-
-    ours = gradients(f32)
-    with use_reference():
-        own, exact = gradients(f32), gradients(f64)
-    for got, base, want in zip(ours, own, exact, strict=True):
-        rounding = torch.finfo(f32).eps * want.abs().max()
-        assert (got - want).abs().max() <= max(2 * (base - want).abs().max(), rounding)

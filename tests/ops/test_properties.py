@@ -4,7 +4,6 @@
 other ones.
 """
 
-import functools
 import math
 from collections.abc import Callable
 
@@ -52,14 +51,10 @@ def largest(tensor: Tensor) -> float:
 
 def sampling_size(case: Case) -> Callable[[str], float]:
     exact = case.to(f64)
-    linear = [name for name in ("image", "weight", "bias") if name in case.inputs]
-    sizes = results(exact, is_reference=True, absolute=linear)
-    grads = sizes["grad"]  # of the output; converted to the samples below
-    if "weight" in linear:
-        grads = grads @ exact.inputs["weight"].abs()
+    sizes = results(exact, is_reference=True, absolute=["image"])
     # For the lens: the sum over all samples, each times the difference of two pixels, times the
     # longest radius.
-    lens = grads.sum().item() * 2 * largest(exact.inputs["image"])
+    lens = sizes["grad"].sum().item() * 2 * largest(exact.inputs["image"])
     lens *= max(1.0, largest(exact.inputs["radii"]))
     # Positions are computed in float64. In a float64 call their rounding matters, in proportion to
     # their distance from 0 in pixels. The reference itself has no more digits.
@@ -68,7 +63,7 @@ def sampling_size(case: Case) -> Callable[[str], float]:
         stretch = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
         turns = 1 + largest(case.settings["azimuths"])
         places += 4 * largest(exact.inputs["radii"]) * max(stretch, 1.0) * turns + 100
-    known = ("out", "grad", *linear)
+    known = ("out", "grad", "image")
     return lambda name: places * (largest(sizes[name]) if name in known else lens)
 
 
@@ -100,7 +95,6 @@ def map_size(case: Case) -> Callable[[str], float]:
 # Operator → the strategy that draws its calls, and the function for the sizes of their results.
 CALLS = {
     "polar_sample": (strategies.sampling, sampling_size),
-    "polar_embed": (functools.partial(strategies.sampling, embed=True), sampling_size),
     "window_attention": (strategies.attention, attention_size),
     "polar_to_image": (strategies.polar_maps, map_size),
 }

@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 
 from darswin.data import IGNORE
-from darswin.train.losses import distance_loss, label_loss
+from darswin.train.distance import distance_loss
+from darswin.train.segmentation import label_loss
 
 f64 = torch.float64
 LABELS, DISTANCES = ("ce", "dice", "ce+dice"), ("silog", "l1", "log_l1")

@@ -7,13 +7,9 @@ import pytest
 import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
-from darswin.train.pixel_metrics import (
-    DISTANCE_METRICS,
-    DistanceSums,
-    LabelSums,
-    Zones,
-    iou_and_recall,
-)
+from darswin.train.distance import METRICS, DistanceSums
+from darswin.train.pixel_metrics import Zones
+from darswin.train.segmentation import LabelSums, iou_and_recall
 
 
 def numpy_iou(predicted, labels, weights, classes):
@@ -97,7 +93,7 @@ def test_scores_of_distances():
 
     for weights, sums in ((np.ones(3000), counts), (area, areas)):
         found = DistanceSums(1).scores(sums.sum(0))
-        assert tuple(found) == DISTANCE_METRICS
+        assert tuple(found) == METRICS
         every = expected(np.ones(3000, bool), weights)
         assert list(found.values()) == pytest.approx(every, rel=1e-9)
         for number in range(3):

@@ -12,10 +12,10 @@ from darswin.data import IGNORE
 from darswin.lens import Equidistant, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train import pixel_task
+from darswin.train.distance import Distance, DistanceData
 from darswin.train.pixel_task import Rays
 from darswin.train.results import tables
-from darswin.train.scene_data import DistanceData, LabelData
-from darswin.train.segmentation import AbsentClass, Distance, Segmentation
+from darswin.train.segmentation import AbsentClass, LabelData, Segmentation
 
 NAME = "darswin_unet_a_nano"
 
@@ -255,7 +255,7 @@ def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
     data = LabelData(str(folder), test_paths=[str(other)])
     with pytest.raises(ValueError, match="test a model on the classes that it was trained on"):
         data.dataset("test", data.test_names[0])
-    assert LabelData(str(folder), lens=str(WOODSCAPE), fit="stretch").frame_fit == "stretch"
+    assert LabelData(str(folder), lens=str(WOODSCAPE), fit="stretch").card_fit == "stretch"
     label_map = tmp_path / "map.json"
     label_map.write_text('{"0": "above", "1": "below", "2": "below"}')
     assert LabelData(str(folder), label_map=str(label_map)).classes == ["above", "below"]

@@ -20,9 +20,9 @@ from darswin.data.warping import CutOff
 from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData
+from darswin.train.distance import DistanceData
 from darswin.train.runs import BestCheckpoint, check_changes
-from darswin.train.scene_data import DistanceData, LabelData
-from darswin.train.segmentation import Segmentation
+from darswin.train.segmentation import LabelData, Segmentation
 from darswin.train.task import Schedule, parameter_groups
 
 # -- optimiser --------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def test_a_crop_is_told_once(tmp_path, recwarn):
     write_plain(tmp_path / "scenes", 6)
     write_frames(tmp_path / "frames", count=40, classes="01")
     frames, lens = str(tmp_path / "frames"), str(WOODSCAPE)
-    for make, framing in (
+    for make, fit in (
         (lambda **o: LabelData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
         (lambda **o: DistanceData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
         (lambda **o: WideAngleData(frames, lens=lens, workers=0, **o), "stretch"),
@@ -136,12 +136,12 @@ def test_a_crop_is_told_once(tmp_path, recwarn):
     ):
         for options in ({}, {"fit": "crop"}, {"fit": "stretch"}):
             data = make(batch_size=1, **options)
-            assert data.framing == options.get("fit", framing)
+            assert data.fit == options.get("fit", fit)
             recwarn.clear()
             for loader in (data.train_dataloader(), data.val_dataloader(), *data.test_dataloader()):
                 next(iter(loader))
             said = [str(one.message) for one in recwarn if one.category is CutOff]
-            assert len(said) == (data.framing == "crop")
+            assert len(said) == (data.fit == "crop")
             for text in said:
                 assert text.startswith("`fit` crop cuts off 19 px at the left and 20 px at the rig")
                 assert text.endswith("; `fit` stretch keeps it")

@@ -261,6 +261,21 @@ def test_the_operators_take_all_of_a_grid():
     assert torch.equal(embed(tokens), expected)
 
 
+def test_samples_get_the_dtype_of_the_weights():
+    frames, view = torch.randint(256, (2, 3, 32, 33)).byte(), PolarView(4, 8, (3, 2))
+    embed, taken = PolarPatchEmbed(18, 5), []
+    prepared = view.prepare(LENSES, (32, 33))
+    wide = embed(view.see(frames, prepared))
+    embed.proj.register_forward_pre_hook(lambda _, inputs: taken.append(inputs[0].dtype))
+    for dtype in (torch.bfloat16, torch.float64, torch.float32):
+        found = embed.to(dtype)(view.see(frames, prepared, dtype))
+        assert taken.pop() == found.dtype == dtype
+        torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = embed(view.see(frames, prepared))
+    torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
+
+
 def test_it_jitters_only_in_training_and_by_torchs_generator():
     images = torch.randn(2, 3, 32, 32)
     sample = PolarView(4, 8, (3, 2), jitter=1.0).eval()

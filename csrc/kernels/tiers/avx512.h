@@ -85,13 +85,13 @@ inline void store_quarters(float* to, Floats v, int64_t lanes) {
   _mm512_mask_storeu_ps(to, joined, _mm512_maskz_compress_ps(fronts, (__m512)v));
 }
 
-// Stores the first `lanes` lanes of each quarter of v at to[place[0]], to[place[1]], ...
-inline void scatter_quarters(float* to, Floats v, const int32_t* place, int64_t lanes) {
+// Stores the first `lanes` lanes of each quarter of v at to[at[0]], to[at[1]], ...
+inline void scatter_quarters(float* to, Floats v, const int32_t* at, int64_t lanes) {
   const auto fronts = static_cast<__mmask8>((1 << lanes) - 1);
-  _mm_mask_storeu_ps(to + place[0], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 0));
-  _mm_mask_storeu_ps(to + place[1], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 1));
-  _mm_mask_storeu_ps(to + place[2], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 2));
-  _mm_mask_storeu_ps(to + place[3], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 3));
+  _mm_mask_storeu_ps(to + at[0], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 0));
+  _mm_mask_storeu_ps(to + at[1], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 1));
+  _mm_mask_storeu_ps(to + at[2], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 2));
+  _mm_mask_storeu_ps(to + at[3], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 3));
 }
 
 }  // namespace

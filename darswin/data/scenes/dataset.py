@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from darswin.data.reframing import resize_scene, turn_scene, warp_scene
-from darswin.data.samples import Draw, Samples
-from darswin.data.scenes.scene import Scene, Scenes
-from darswin.data.scenes.targets import IGNORE
-from darswin.data.warping import Crop, picture_size, taken_part
+from darswin.data.sample import Sample
+from darswin.data.samples import Draw, Samples, as_tensor
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import nothing
+from darswin.data.warping import Crop
 from darswin.lens import Lens
 from darswin.utils.image import Header
 from darswin.utils.parameters import check
@@ -27,7 +26,7 @@ class SceneSamples(Samples):
         scenes: the pictures, their targets and lenses.
         crop: the least share of a picture's side, in (0, 1], for random parts of the pictures. The
             lens follows, and its principal point moves off the middle. None uses whole pictures.
-        options: size, framing, mean, std, turns, lens_augmentation, augment, erase, seed and
+        options: size, fit, mean, std, turns, lens_augmentation, augment, erase, seed and
             skip_broken, as for `Calibrated`.
 
     Raises:
@@ -52,21 +51,8 @@ class SceneSamples(Samples):
     def _check(self, index: int, headers: Sequence[Header]) -> None:
         self.scenes.check(index, *headers)
 
-    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, Tensor]:
-        image, target, lens = self._reframed(self.scenes[draw.picture], draw)
-        kind = torch.int64 if self.scenes.target == "labels" else torch.float32
-        return image, lens, torch.from_numpy(np.ascontiguousarray(target)).to(kind)
-
-    def _reframed(self, scene: Scene, draw: Draw) -> Scene:
-        turn, crop = self._turn(draw), self._crop(draw)
-        if self.lens_augmentation is not None:
-            lens = self._other_lens(draw, scene.lens, crop)
-            return warp_scene(scene, lens, self.size, turn)
-        height, width = scene.target.shape
-        taken = taken_part((height, width), self.framing, crop)
-        if turn is not None and turn.angle:
-            return turn_scene(scene, turn, taken, self.size)
-        return resize_scene(scene, taken, self.size, turn is not None and turn.mirrored)
+    def _read(self, draw: Draw) -> Sample:
+        return self.scenes[draw.picture]
 
     def _crop(self, draw: Draw) -> Crop | None:
         if self.crop is None:
@@ -74,19 +60,8 @@ class SceneSamples(Samples):
         rng = self._random(draw.epoch, draw.lens, 3)
         return Crop(rng.uniform(self.crop, 1), rng.random(), rng.random())
 
-    def _taken(self, index: int) -> tuple[tuple[int, int], Lens]:
-        lens = self.scenes[index].lens
-        return picture_size(lens), lens
-
     def _lens_alone(self, draw: Draw) -> Lens:
-        own = self.scenes.lens_alone(draw.picture)
-        if self.lens_augmentation is not None:
-            return self._other_lens(draw, own, self._crop(draw))
-        taken = taken_part(picture_size(own), self.framing)
-        return own.cropped(*taken).resized((self.size, self.size))
+        return self.scenes.lens_alone(draw.picture)
 
     def _unknown(self) -> Tensor:
-        shape = self.size, self.size
-        if self.scenes.target == "labels":
-            return torch.full(shape, IGNORE, dtype=torch.int64)
-        return torch.zeros(shape)
+        return as_tensor(nothing(self.scenes.target, (self.size, self.size)))

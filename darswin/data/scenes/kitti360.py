@@ -14,7 +14,7 @@ from pathlib import Path
 
 from darswin.data.scenes.files import Options, lenses_beside, pair, stems
 from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import SUFFIXES
+from darswin.data.scenes.targets import KINDS
 
 
 def is_kitti360(root: Path) -> bool:
@@ -34,7 +34,7 @@ def open_kitti360(root: Path, options: Options) -> Scenes:
         raise FileNotFoundError(f"no pictures in {root}/data_2d_raw/*/image_0[23]/data_rgb")
     pairs = pair(
         pictures,
-        stems(root / "distance", SUFFIXES["distance"]),
+        stems(root / "distance", KINDS["distance"].suffixes),
         lambda found: options.choose(found, root, group=lambda stem: stem.split("/")[0]),
         root=root,
         what="distance",

@@ -16,7 +16,7 @@ from darswin.data.scenes.files import (
     stems,
 )
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, read_palette
-from darswin.data.scenes.targets import SUFFIXES, read_distance, read_labels
+from darswin.data.scenes.targets import KINDS, read_labels
 from darswin.data.splits import Split, split_folders
 from darswin.utils.parameters import naming
 
@@ -49,9 +49,9 @@ def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scene
     target = options.target
     if target == "labels" and not (folder / target).is_dir():
         refuse_outlines(root)
-    targets = stems(folder / target, SUFFIXES[target])
+    targets = stems(folder / target, KINDS[target].suffixes)
     pairs = pair(pictures_in(folder / "images"), targets, choose, root=folder, what=target)
-    classes, read = NO_CLASSES, read_distance
+    classes, read = NO_CLASSES, KINDS[target].read
     if target == "labels":
         class_of, classes = options.labels(partial(_classes, folder, root))
         read = partial(read_labels, classes=len(classes.names), class_of=class_of)

@@ -11,30 +11,18 @@ import torch
 
 from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Form, form_of
+from darswin.data.sample import Sample
 from darswin.data.scenes.targets import (
     IGNORE,
+    KINDS,
     Target,
     nothing_of,
-    read_distance,
-    read_labels,
     target_header,
 )
 from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
 from darswin.utils.image import Header, read_header, read_oriented
 from darswin.utils.text import is_json_file, read_json
-
-
-class Scene(NamedTuple):
-    """A picture with a label or a distance for each of its pixels.
-
-    Attributes: image: (H, W, C) uint8; target: (H, W), uint8 ids with `IGNORE`, or float32 metres
-    along the ray with 0 for unknown; lens: one lens, with a center and this image_size.
-    """
-
-    image: np.ndarray
-    target: np.ndarray
-    lens: Lens
 
 
 class Classes(NamedTuple):
@@ -55,7 +43,7 @@ class Scenes(Limited):
         lenses: the lenses of the pictures. target: "labels" or "distance", the kind of the targets.
         classes: the names and colours of the ids in labels.
         views: the name of each picture's camera in `cameras`; None takes the names from `lenses`.
-        read: the function that reads a target file; None means `read_labels` or `read_distance`.
+        read: the function that reads a target file; None means the one of `target`.
         trim: (rows, height): the number of rows that are cut at the top and at the bottom of a
             picture of this height, and the same share of other pictures. The lenses follow.
 
@@ -83,8 +71,8 @@ class Scenes(Limited):
         self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, 3
         self.classes, self.colors = list(classes.names), list(classes.colors)
         if read is None:
-            labels = target == "labels"
-            read = partial(read_labels, classes=len(classes.names)) if labels else read_distance
+            read = KINDS[target].read
+            read = partial(read, classes=len(classes.names)) if target == "labels" else read
         self.read, self.trim = read, trim
         # Worker processes share arrays, but would copy a million strings.
         self._pictures = np.array([os.fsencode(picture) for picture, _ in files], np.bytes_)
@@ -101,7 +89,7 @@ class Scenes(Limited):
     def __len__(self) -> int:
         return len(self._pictures)
 
-    def __getitem__(self, index: int) -> Scene:
+    def __getitem__(self, index: int) -> Sample:
         """The scene; BrokenImageError or ValueError for files that are broken or do not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
         target = self.read(self.target_file(index))
@@ -112,7 +100,7 @@ class Scenes(Limited):
         kept = slice(rows, size[0] - rows)
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
-        return Scene(image, target, self._trimmed(lens))
+        return Sample(image, target, self._trimmed(lens))
 
     def headers(self, index: int) -> list[Header]:
         """The headers of the picture and of its target."""

@@ -1,10 +1,10 @@
 """Reading the targets of scenes: a label or a distance for each pixel."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,12 +13,13 @@ from PIL import Image, UnidentifiedImageError
 from darswin.data.splits import some
 from darswin.utils.image import BrokenImageError, Header, decoded, file_content, read_header
 from darswin.utils.parameters import naming
+from darswin.utils.tasks import PixelTask
 
 IGNORE = 255  # the label of an unlabelled pixel
 PER_METRE = 256  # the scale of distances in a PNG of 16 bits
 Target = Literal["labels", "distance"]
-# The suffixes of target files.
-SUFFIXES: dict[Target, tuple[str, ...]] = {"labels": (".png",), "distance": (".png", ".npy")}
+# The targets of the tasks that predict each pixel.
+TARGETS: dict[PixelTask, Target] = {"segmentation": "labels", "distance": "distance"}
 
 
 class OddLabels(UserWarning):
@@ -168,3 +169,25 @@ def target_header(path: Path) -> Header:
 
 def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+class Kind(NamedTuple):
+    """A kind of targets. Attributes: suffixes: of its files; dtype: of its arrays (H, W); read: the
+    function that reads a file."""
+
+    suffixes: tuple[str, ...]
+    dtype: type
+    read: Callable[..., np.ndarray]
+
+
+KINDS: dict[Target, Kind] = {
+    "labels": Kind((".png",), np.uint8, read_labels),
+    "distance": Kind((".png", ".npy"), np.float32, read_distance),
+}
+
+
+def nothing(kind: Target, shape: tuple[int, int]) -> np.ndarray:
+    """A target without any known pixel."""
+    target: np.ndarray = np.empty(shape, KINDS[kind].dtype)
+    target[:] = nothing_of(target)
+    return target

@@ -29,19 +29,19 @@ def of(folder, target="labels", **options):
     return SceneSamples(scenes, size=48, mean=[0], std=[1], **options)
 
 
-@pytest.mark.parametrize("framing", ["crop", "stretch"])
-def test_a_sample_is_the_scene_at_the_size(folder, framing):
-    dataset = of(folder, framing=framing)
+@pytest.mark.parametrize("fit", ["crop", "stretch"])
+def test_a_sample_is_the_scene_at_the_size(folder, fit):
+    dataset = of(folder, fit=fit)
     image, lens, labels = dataset[2]
     scene = dataset.scenes[2]
-    expected, there = at_size(scene.image, scene.lens, 48, framing)
+    expected, there = at_size(scene.image, scene.lens, 48, fit)
     np.testing.assert_allclose(255 * image[0].numpy(), expected[..., 0], atol=1e-3)
     assert str(lens) == str(there)
     assert labels.dtype == torch.int64 and labels.shape == (48, 48)
     assert set(labels.unique().tolist()) <= {0, 1, 2, IGNORE}
     beyond = pixel_angles(lens, (48, 48))[0].isnan()
     assert torch.equal(labels == IGNORE, beyond)
-    distance = of(folder, "distance", framing=framing)[2][2]
+    distance = of(folder, "distance", fit=fit)[2][2]
     assert distance.dtype == torch.float32 and torch.equal(distance == 0, beyond)
     assert torch.equal(dataset[Draw(7, 2, 5)][2], labels)  # nothing is random
 

@@ -1,4 +1,4 @@
-// Bilinear interpolation in a far image, in place.
+// Bilinear interpolation in an image that is read directly.
 //
 // There are four ways to read the pixels. If the channels are planes, it takes four points at a
 // time, or sixteen by gathers on CPUs with fast gathers. If the channels of a pixel are neighbours
@@ -28,7 +28,7 @@ inline Vector<float, 4> two_pairs(const E* here, const E* there) {
 // neighbour as one value of 64 bits. The struct is a template, because only tiers with such
 // registers have gather_pairs and permuted.
 template <typename T>
-struct FarSixteen {
+struct Sixteen {
   using V = Vector<T, 16>;
   using Offsets = Vector<int64_t, 32 / sizeof(T)>;
   using Index = Vector<int32_t, 16>;
@@ -37,7 +37,7 @@ struct FarSixteen {
   V up, up2, down, down2;   // weights of the upper and the lower pixels, each twice
   V left, right;
 
-  FarSixteen(const FarPlaces<T>& places, int64_t k)
+  Sixteen(const DirectPlaces<T>& places, int64_t k)
       : offset(load<Offsets>(places.offset + k)), offset2(load<Offsets>(places.offset + k + 8)) {
     constexpr Index twice = {0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7};
     const V lower = load<V>(places.lower + k);
@@ -84,11 +84,11 @@ inline void store_fours(Vector<float, 4> x, Vector<float, 4> y, Vector<float, 4>
   store(to + 8, __builtin_shufflevector(zx, yz, 2, 3, 6, 7));
 }
 
-// The output places of a line: sample k goes to to[k * step]. A sample may have fewer than four
+// The output of a line: sample k goes to to[k * step]. A sample may have fewer than four
 // values. A store of four values may reach beyond it if the next sample of the line follows there,
 // or anywhere if `spare` is true.
 template <typename T>
-struct FarOutput {
+struct LineOutput {
   T* to;
   int64_t step;
   bool spare;
@@ -96,9 +96,9 @@ struct FarOutput {
 
 // An image with pixels of type E, read at the places of a block of points.
 template <typename T, typename E>
-class FarImage {
+class DirectImage {
  public:
-  FarImage(const PolarSampleArgs<T>& args, int64_t b, const FarPlaces<T>& places)
+  DirectImage(const PolarSampleArgs<T>& args, int64_t b, const DirectPlaces<T>& places)
       : a(args),
         b(b),
         places(places),
@@ -109,7 +109,7 @@ class FarImage {
         next(args.image_stride[3]),
         layout(layout_of(args)) {}
 
-  // Returns how many separate places in memory the channels of a pixel are read from.
+  // Returns from how many planes the channels of a pixel are read.
   int64_t planes() const { return layout == kTogether ? 1 : channels; }
 
   // Prefetches the pixels of a later line.
@@ -126,7 +126,7 @@ class FarImage {
       if (count < 16) return points(all, 0, count, {to, channels, false});
       for (int64_t k = 0; k < count; k += 16) {
         k = smaller(k, count - 16);
-        const FarSixteen<T> sixteen(places, k);
+        const Sixteen<T> sixteen(places, k);
         if (!sixteen.inside()) {
           points(all, k, k + 16, {to, channels, false});
           continue;
@@ -143,7 +143,7 @@ class FarImage {
     }
   }
 
-  void sample(const Line& line, const FarOutput<T>& out) const {
+  void sample(const Line& line, const LineOutput<T>& out) const {
     if constexpr (is_same_v<T, float>) {
       switch (layout) {
         case kGray:
@@ -180,17 +180,17 @@ class FarImage {
   // has already sampled. `kRow` means that the points and their samples follow each other in
   // memory.
   template <int kChannels, bool kRow>
-  void fours(const Line& line, const FarOutput<T>& out) const {
+  void fours(const Line& line, const LineOutput<T>& out) const {
     if (line.count < 4) return points(line, 0, line.count, out);
     const int64_t step = kRow ? 1 : line.step;
     for (int64_t k = 0; k < line.count; k += 4) {
       k = smaller(k, line.count - 4);
-      const int64_t place = line.place + k * step;
-      const int64_t* offset = places.offset + place;
+      const int64_t first = line.first + k * step;
+      const int64_t* offset = places.offset + first;
       if ((offset[0] | offset[step] | offset[2 * step] | offset[3 * step]) < 0) {
         points(line, k, k + 4, out);
       } else {
-        four<kChannels, kRow>(place, step, {out.to + k * out.step, out.step, out.spare});
+        four<kChannels, kRow>(first, step, {out.to + k * out.step, out.step, out.spare});
       }
     }
   }
@@ -201,13 +201,13 @@ class FarImage {
 
   // One load takes a pixel and its right neighbour.
   template <int kChannels, bool kRow>
-  void four(int64_t place, int64_t step, const FarOutput<T>& out) const {
-    const V right = every(places.right + place, step), lower = every(places.lower + place, step);
+  void four(int64_t first, int64_t step, const LineOutput<T>& out) const {
+    const V right = every(places.right + first, step), lower = every(places.lower + first, step);
     const V down = __builtin_shufflevector(lower, lower, 0, 0, 1, 1);
     const V down2 = __builtin_shufflevector(lower, lower, 2, 2, 3, 3);
     const V up = 1 - down, up2 = 1 - down2, left = 1 - right;
     const E* point[4];
-    for (int p = 0; p < 4; ++p) point[p] = pixels + places.offset[place + p * step];
+    for (int p = 0; p < 4; ++p) point[p] = pixels + places.offset[first + p * step];
     const auto plane = [&](int64_t c) {
       const int64_t top = c * channel, bottom = top + below;
       const V pairs = between(two_pairs(point[0] + top, point[1] + top),
@@ -215,8 +215,8 @@ class FarImage {
       const V pairs2 = between(two_pairs(point[2] + top, point[3] + top),
                                two_pairs(point[2] + bottom, point[3] + bottom), up2, down2);
       const V v = between(evens(pairs, pairs2), odds(pairs, pairs2), left, right);
-      if constexpr (is_same_v<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
-      return v;
+      if constexpr (!is_same_v<E, uint8_t>) return v;
+      return normalized(v, splat<V>(a.pixel_scale[c]), splat<V>(a.pixel_offset[c]));
     };
     // No computation is written in two branches. The compiler would move the common part out of
     // both branches. Half of the operations that it fuses elsewhere would then stay unfused.
@@ -236,7 +236,7 @@ class FarImage {
 
   // Stores four samples of three channels.
   template <bool kRow>
-  static void store_three(V x, V y, V z, const FarOutput<T>& out) {
+  static void store_three(V x, V y, V z, const LineOutput<T>& out) {
     if constexpr (kRow) {
       store_fours(x, y, z, out.to);
     } else if (out.spare) {
@@ -250,7 +250,7 @@ class FarImage {
   }
 
   template <int kChannels>
-  void together(const Line& line, const FarOutput<T>& out) const {
+  void together(const Line& line, const LineOutput<T>& out) const {
     constexpr int kSkip = 4 - kChannels;
     V scale{}, shift{};
     for (int c = 0; is_same_v<E, uint8_t> && c < kChannels; ++c) {
@@ -259,20 +259,20 @@ class FarImage {
     }
     const int64_t whole = kChannels == 4 || out.spare ? line.count : line.flat ? line.count - 1 : 0;
     for (int64_t k = 0; k < line.count; ++k) {
-      const int64_t place = line.place + k * line.step;
-      if (places.offset[place] < 0) {
+      const int64_t index = line.first + k * line.step;
+      if (places.offset[index] < 0) {
         points(line, k, k + 1, out);
         continue;
       }
       // The load of the right neighbour ends with its last channel, so that it stays in the image.
-      const E *pixel = pixels + places.offset[place], *neighbour = pixel + next - kSkip;
-      const V down = splat<V>(places.lower[place]), right = splat<V>(places.right[place]);
+      const E *pixel = pixels + places.offset[index], *neighbour = pixel + next - kSkip;
+      const V down = splat<V>(places.lower[index]), right = splat<V>(places.right[index]);
       const V up = 1 - down;
       const V l = between(load<V>(pixel), load<V>(pixel + below), up, down);
       const V n = between(load<V>(neighbour), load<V>(neighbour + below), up, down);
       const V r = __builtin_shufflevector(n, n, kSkip, kSkip + 1, (kSkip + 2) % 4, 3);
       V v = between(l, r, 1 - right, right);
-      if constexpr (is_same_v<E, uint8_t>) v = v * scale + shift;
+      if constexpr (is_same_v<E, uint8_t>) v = normalized(v, scale, shift);
       T* to = out.to + k * out.step;
       if (k < whole) {
         store(to, v);
@@ -283,34 +283,30 @@ class FarImage {
   }
 
   // Samples points [begin, end) of a line, which may lie on the border or outside.
-  void points(const Line& line, int64_t begin, int64_t end, const FarOutput<T>& out) const {
+  void points(const Line& line, int64_t begin, int64_t end, const LineOutput<T>& out) const {
     for (int64_t k = begin; k < end; ++k) {
-      const int64_t place = line.place + k * line.step, offset = places.offset[place];
-      const T right = places.right[place], lower = places.lower[place];
+      const int64_t index = line.first + k * line.step, offset = places.offset[index];
+      const T right = places.right[index], lower = places.lower[index];
       T* to = out.to + k * out.step;
       if (offset < 0) {
-        const Corners<T, E> corners(a, b, places.column[place], places.row[place]);
-        for (int64_t c = 0; c < channels; ++c) {
-          const Vector<T, 4> p = corners.read(c);
-          const T l = between(p[0], p[2], 1 - lower, lower);
-          const T r = between(p[1], p[3], 1 - lower, lower);
-          to[c] = between(l, r, 1 - right, right);
-        }
+        const Corners<T, E> corners(a, b, places.column[index], places.row[index]);
+        for (int64_t c = 0; c < channels; ++c) to[c] = corners.sample(c, right, lower);
         continue;
       }
       const E* pixel = pixels + offset;
       for (int64_t c = 0; c < channels; ++c, pixel += channel) {
         const E* bottom = pixel + below;
-        const T l = between(load<T>(pixel), load<T>(bottom), 1 - lower, lower);
-        const T r = between(load<T>(pixel + next), load<T>(bottom + next), 1 - lower, lower);
-        to[c] = normalized<E>(a, between(l, r, 1 - right, right), c);
+        const T sample = bilinear(load<T>(pixel), load<T>(pixel + next), load<T>(bottom),
+                                  load<T>(bottom + next), right, lower);
+        to[c] = is_same_v<E, uint8_t> ? normalized(sample, a.pixel_scale[c], a.pixel_offset[c])
+                                      : sample;
       }
     }
   }
 
   const PolarSampleArgs<T>& a;
   const int64_t b;
-  const FarPlaces<T>& places;
+  const DirectPlaces<T>& places;
   const E* pixels;
   const int64_t channels, channel, below, next;  // strides to the next channel, row, column
   const Layout layout;
