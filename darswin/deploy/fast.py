@@ -72,9 +72,9 @@ def _(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
 
 @fast.register
 def _(block: ConvBlock, dtype: torch.dtype) -> nn.Module:
-    layers: list[Any] = list(block)
-    convs = (fuse_conv_bn_eval(*layers[k : k + 2]) for k in (0, 3))
-    return nn.Sequential(*(part for conv in convs for part in (InDtype(conv, dtype), layers[2])))
+    conv1, norm1, relu, conv2, norm2, _ = list[Any](block)
+    first, second = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
+    return nn.Sequential(InDtype(first, dtype), relu, InDtype(second, dtype), relu)
 
 
 @fast.register(PolarPatchEmbed)

@@ -44,12 +44,11 @@ def optimize(
     Args:
         model: a model of `create_model`, on the CPU.
         dtype: torch.float32, torch.bfloat16 or torch.int8. With bfloat16, the maps between the
-            layers and the result are bfloat16; distances, and the layers that refine the pixels of
-            dense models, stay float32. With int8, the products of a quantized model (see
-            `quantize_model`) are computed with 8 bits, and the rest with float32; for a picture
-            with infinite or NaN pixels the result is finite but meaningless. "fastest": int8 for a
-            quantized model if this CPU supports it, otherwise float32 or bfloat16, whichever is
-            faster here.
+            layers and the result are bfloat16; distances stay float32. With int8, the products of a
+            quantized model (see `quantize_model`) are computed with 8 bits, and the rest with
+            float32; for a picture with infinite or NaN pixels the result is finite but meaningless.
+            "fastest": int8 for a quantized model if this CPU supports it, otherwise float32 or
+            bfloat16, whichever is faster here.
         lens: a single lens, if all images come from one camera. The copy is then called
             `optimized(images)`. It computes the grid and the position biases once for each image
             size.

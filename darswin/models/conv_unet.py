@@ -98,7 +98,7 @@ class ConvUnet(PixelModel):
 
     def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Tensor:
         if prepared.rays is not None:
-            check_count(len(prepared.rays), x)
+            check_count(prepared.rays.shape[0], x)
         x = with_rays(x, prepared.rays)
         x = x.contiguous(memory_format=torch.channels_last)
         maps: list[Tensor] = []

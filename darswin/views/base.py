@@ -233,7 +233,7 @@ class PixelView(View):
         if prepared.points is None:
             return images
         assert isinstance(prepared.points, Tensor)
-        check_count(len(prepared.points), images)
+        check_count(prepared.points.shape[0], images)
         return sample_at(images, prepared.points)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
@@ -250,8 +250,8 @@ class PixelView(View):
 
     def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
         seen = check_seen_images(seen, self.size or prepared.size, channels)
-        if prepared.points is not None:
-            check_count(len(prepared.points), seen)
+        if isinstance(prepared.points, Tensor):
+            check_count(prepared.points.shape[0], seen)
         return seen
 
 
@@ -303,7 +303,8 @@ def check_lens(lens: Lens | None, size: Pair) -> Lens:
 
 
 def check_count(lenses: int, images: Tensor) -> None:
-    """ValueError unless there is one lens for each image or one for all."""
+    """ValueError unless there is one lens for each image or one for all. The number of lenses must
+    come from a shape: `len` would fix the batch size of a graph."""
     if lenses not in (1, images.shape[0]):
         raise ValueError(
             f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
