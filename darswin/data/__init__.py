@@ -4,7 +4,7 @@ from darswin.data.augment import Mixing, RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations
 from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
 from darswin.data.pictures import open_source
-from darswin.data.reframing import Moved, RandomTurns, Turn, Warped, at_size, reframe
+from darswin.data.reframing import Moved, RandomTurns, Reframing, Turn, Warped, at_size, reframe
 from darswin.data.sample import Sample
 from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
@@ -28,6 +28,7 @@ __all__ = [
     "RandAugment",
     "RandomErasing",
     "RandomTurns",
+    "Reframing",
     "Sample",
     "SceneSamples",
     "Scenes",

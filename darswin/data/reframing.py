@@ -32,7 +32,7 @@ _APART = 1.5
 _RADII = 4096  # entries of a table
 _AZIMUTHS = 1024
 _NUDGE = 1e-3  # px, more than the rounding of places in float32
-_OUTSIDE = -1e6  # px, beyond any picture
+_FAR = 1e5  # px, or the multiple of a radius, that leads beyond any picture
 _ROUNDING = 1 + 1e-6  # of radii at θ_max
 _MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
 
@@ -154,8 +154,8 @@ def at_size(image: np.ndarray, lens: Lens, size: int, fit: Fit) -> tuple[np.ndar
     Raises:
         ValueError: an unknown `fit`, or a picture with another aspect ratio than its lens.
     """
+    picture_size(lens)  # raises ValueError for a lens without one
     whole = image.shape[0], image.shape[1]
-    picture_size(lens)
     part = taken_part(whole, fit)
     moved = Moved(lens.in_picture(whole), part, size_of_part(part, size, fit))
     return moved.image(image), moved.lens
@@ -165,10 +165,15 @@ def at_size(image: np.ndarray, lens: Lens, size: int, fit: Fit) -> tuple[np.ndar
 
 
 class Moved(Reframing):
-    """Shows a part of a picture at a size (H, W), after a turn about the optical axis.
+    """Shows a part of a picture at another size, after a turn about the optical axis.
 
     The pixels move by an affine map. They are sheared if they are oblong, so that the picture looks
     rotated through its lens. Pixels beyond θ_max stay in the image, but have no target.
+
+    Args:
+        lens: the lens that took the picture, with its image_size.
+        part: top, left, height and width, px, in the turned picture, which keeps its size.
+        size: (H, W) of the new picture. turn, render: see `Reframing`.
     """
 
     def __init__(
@@ -273,7 +278,7 @@ class Warped(Reframing):
     def _places(self, y: np.ndarray, x: np.ndarray) -> Sequence[np.ndarray]:
         if not self.lens.is_radial:
             places = self.to_old(np.stack(np.meshgrid(x, y), -1))
-            return np.moveaxis(np.nan_to_num(places, nan=_OUTSIDE).astype(np.float32), -1, 0).copy()
+            return np.moveaxis(np.nan_to_num(places, nan=_FAR).astype(np.float32), -1, 0).copy()
         last, ratios, angles = self._curves
         u, v = _flat(self.lens, y, x, self._turn.matrix.T)
         radius = np.sqrt(u * u + v * v)
@@ -285,15 +290,12 @@ class Warped(Reframing):
         def at(table: np.ndarray) -> np.ndarray:
             return table[0].take(index, mode="clip") + table[1].take(index, mode="clip") * share
 
-        ratio = at(ratios)
+        ratio, offset = at(ratios), np.zeros((2, 1, 1), np.float32)
         if angles is not None:
             ray = np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None]
             rays = torch.from_numpy(at(angles))[None], torch.from_numpy(ray)[None]
-            offset = self._own.offset(*rays)[0].numpy()
-        u *= ratio
-        v *= ratio
-        if angles is not None:
-            u, v = u + offset[..., 0], v + offset[..., 1]
+            offset = np.moveaxis(self._own.offset(*rays)[0].numpy().astype(np.float32), -1, 0)
+        u, v = u * ratio + offset[0], v * ratio + offset[1]
         if self._own.affine is not None:
             u, v = (a * u + b * v for a, b in self._own.affine[0].tolist())
         cx, cy = self._own.center_in()[0].tolist()
@@ -318,7 +320,7 @@ class Warped(Reframing):
         ratios[0] = old[1] / new[1]
         tables = [ratios] if self._own.is_radial else [ratios, np.interp(radii, new, theta[0])]
         ratio, *angle = (np.stack((k, np.diff(k, append=k[-1]))).astype(np.float32) for k in tables)
-        ratio[0, -1] = -_OUTSIDE
+        ratio[0, -1] = _FAR
         return new[-1].item(), ratio, angle[0] if angle else None
 
 
