@@ -5,8 +5,7 @@
 // neighbour. A border of zeros surrounds the image, so that the inner loop needs no bounds test. A
 // point outside the image reads the zeros at the lower right, where the border is two pixels wide.
 //
-// An image that is larger, or has too few points to be worth a copy, is read directly, with any
-// strides and any type of pixel.
+// A larger image, or one with too few points for a copy, is read directly, with any strides.
 //
 // 8-bit pixels are interpolated first, and the sample is normalized. Pixels outside count as 0
 // after the normalization. So a sample is scale * (its pixels) + offset * (its coverage), where the
@@ -38,9 +37,8 @@ struct Packed {
         size((a.height + 3) * row) {}
 };
 
-// The places of a block of points among the pixels. `right` and `lower` are the distances of a
-// point from its upper left pixel, to the right and downwards, from 0 to 1. The last register of a
-// row may reach beyond the row.
+// The places of a block of points among the pixels. `right` and `lower` are the distances from the
+// upper left pixel, from 0 to 1. The last register of a row may reach beyond the row.
 constexpr int kPlaces = kBlock + kDoubles;
 template <typename T>
 struct Places {
