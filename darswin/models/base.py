@@ -80,7 +80,9 @@ class Model(nn.Module, Generic[Result]):
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Result:
         """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
-        return self._run(*self._checked_and_prepared(images, lens))
+        images, prepared = self._checked_and_prepared(images, lens)
+        x = self.view.see(images, prepared, self.dtype)
+        return self.forward_network(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """Everything that depends on the lens but not on the pixels, for any number of `run` calls.
@@ -114,9 +116,7 @@ class Model(nn.Module, Generic[Result]):
             ValueError: the images have a wrong shape or are on another device than the model, or
                 the number of lenses is neither B nor 1.
         """
-        return self._run(self._checked(images), prepared)
-
-    def _run(self, images: Tensor, prepared: Prepared) -> Result:
+        images = self._checked(images)
         x = self.view.see(images, prepared, self.dtype)
         return self.forward_network(x, prepared, images)
 

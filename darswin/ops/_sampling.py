@@ -10,12 +10,9 @@ from darswin.ops import _library
 from darswin.ops.checks import (
     DTYPES,
     as_int,
-    channels_first,
     check_has_batch,
     check_jitter,
-    check_pair,
     check_tensor,
-    per_channel,
 )
 
 # Index of each field of `Sampling` that has a gradient → its group: image, lens or offsets.
@@ -55,41 +52,6 @@ class Sampling(NamedTuple):
         return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)
 
 
-def as_sampling(
-    image: Tensor,
-    radii: Tensor,
-    azimuths: Tensor,
-    center: Tensor,
-    affine: Tensor | None,
-    offsets: Tensor | None,
-    jitter: float,
-    seed: int | Tensor,
-    samples: tuple[int, int],
-    mean: float | Sequence[float],
-    std: float | Sequence[float],
-    channels_last: bool | None,
-) -> Sampling:
-    """The arguments of a public function as those of its operator. Raises TypeError, ValueError or
-    NotImplementedError for what the operator does not see; `check_sampling` explains the rest."""
-    if not isinstance(image, Tensor) or image.dim() != 4:
-        _check_image(image, channels_last)  # raises
-    if isinstance(azimuths, Tensor) and azimuths.requires_grad and torch.is_grad_enabled():
-        _refuse_gradient_of_azimuths()
-    dtype, frames = image.dtype, image.dtype == torch.uint8
-    if channels_last is not None or frames:
-        image = channels_first("image", image, channels_last)
-    moves = type(jitter) is not float or jitter != 0
-    autocast = None if dtype == torch.float64 else _library.autocast_dtype(image)
-    return Sampling(
-        image, radii, azimuths, center, affine, offsets,
-        *(_jitter_tensors(jitter, seed) if moves else (None, None)),
-        check_pair("samples", samples, lowest=1),
-        per_channel("mean", mean, image.shape[1]) if frames else (),
-        per_channel("std", std, image.shape[1]) if frames else (),
-        torch.bfloat16 in (dtype, autocast),
-    )  # fmt: skip
-
-
 def check_sampling(
     image: Tensor,
     radii: Tensor,
@@ -103,7 +65,7 @@ def check_sampling(
     *others: object,
 ) -> None:
     """Raises TypeError or ValueError unless the arguments of an operator fit."""
-    _check_image(image)
+    check_image(image)
     batch = image.shape[0]
     real = (torch.float64 if image.dtype == torch.float64 else torch.float32,)
     form = "(B or 1, R·S_r) = ({} or 1, any)"
@@ -125,14 +87,14 @@ def check_sampling(
         )
 
 
-def _check_image(image: Tensor, channels_last: bool | None = None) -> None:
+def check_image(image: Tensor, channels_last: bool | None = None) -> None:
     if isinstance(image, Tensor):
         check_has_batch("image", image, channels_last)
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
     check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
 
 
-def _refuse_gradient_of_azimuths() -> None:
+def refuse_gradient_of_azimuths() -> None:
     if not _library.reference_in_use():
         raise NotImplementedError(
             "azimuths require a gradient, which only the reference computes: run within "
@@ -141,7 +103,7 @@ def _refuse_gradient_of_azimuths() -> None:
         )
 
 
-def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
+def jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
     """Jitter and seed as tensors for the operators; None and None without jitter."""
     jitter = check_jitter(jitter)
     if jitter == 0:

@@ -7,8 +7,15 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops._sampling import GRADIENTS, Sampling, as_sampling, check_sampling
-from darswin.ops.checks import check_layout
+from darswin.ops._sampling import (
+    GRADIENTS,
+    Sampling,
+    check_image,
+    check_sampling,
+    jitter_tensors,
+    refuse_gradient_of_azimuths,
+)
+from darswin.ops.checks import LAYOUTS, channels_first, check_layout, check_pair, per_channel
 
 _SAMPLE = torch.ops.darswin.polar_sample.default
 
@@ -85,10 +92,25 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    check_layout(layout)
-    sampling = as_sampling(
-        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
-        channels_last,
+    # What the operator does not see is checked here; `check_sampling` explains the rest.
+    if not isinstance(image, Tensor) or image.dim() != 4:
+        check_image(image, channels_last)  # raises
+    if layout not in LAYOUTS:
+        check_layout(layout)  # raises
+    if isinstance(azimuths, Tensor) and azimuths.requires_grad and torch.is_grad_enabled():
+        refuse_gradient_of_azimuths()
+    dtype, frames = image.dtype, image.dtype == torch.uint8
+    if channels_last is not None or frames:
+        image = channels_first("image", image, channels_last)
+    moves = type(jitter) is not float or jitter != 0
+    autocast = None if dtype == torch.float64 else _library.autocast_dtype(image)
+    sampling = Sampling(
+        image, radii, azimuths, center, affine, offsets,
+        *(jitter_tensors(jitter, seed) if moves else (None, None)),
+        check_pair("samples", samples, lowest=1),
+        per_channel("mean", mean, image.shape[1]) if frames else (),
+        per_channel("std", std, image.shape[1]) if frames else (),
+        torch.bfloat16 in (dtype, autocast),
     )  # fmt: skip
     return _library.call(_SAMPLE, check_sampling, _reference, (*sampling, layout == "tokens"))
 
