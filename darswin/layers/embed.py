@@ -3,6 +3,7 @@
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
+from darswin.ops._library import autocast_dtype
 
 
 class PatchProjection(nn.Module):
@@ -36,4 +37,6 @@ class PolarPatchEmbed(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Samples (B, R, A, S_r·S_φ·C) of any floating-point dtype → (B, R, A, D)."""
-        return self.norm(self.proj(x.to(self.proj.weight.dtype)))
+        if autocast_dtype(x) is None:  # which would convert them itself
+            x = x.to(self.proj.weight.dtype)
+        return self.norm(self.proj(x))

@@ -1,0 +1,220 @@
+// Packs an image, and samples the packed copy.
+//
+// Interpolation goes first downwards, then to the right, four channels at a time.
+#pragma once
+
+#include "polar_image.h"
+
+namespace darswin {
+namespace {
+
+// Interleaves four planes: (4, width) -> (width, 4).
+template <typename T>
+void interleave(const T* const plane[4], int64_t width, T* to) {
+  using V = Vector<T, 4>;
+  int64_t x = 0;
+  for (; x + 4 <= width; x += 4) {
+    transpose4(load<V>(plane[0] + x), load<V>(plane[1] + x), load<V>(plane[2] + x),
+               load<V>(plane[3] + x), to + 4 * x, 4);
+  }
+  for (; x < width; ++x) {
+    for (int c = 0; c < 4; ++c) to[4 * x + c] = plane[c][x];
+  }
+}
+
+// Packs image b. `planes` has room for 4 rows of the image. Channels beyond those of the image are
+// 0, or 1 for pixels of 8 bits.
+template <typename T, typename E>
+void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* planes, T* to) {
+  constexpr T kBeyond = is_same_v<E, uint8_t>;
+  const E* image = static_cast<const E*>(a.image) + b * a.image_stride[0];
+  const int64_t channel_stride = a.image_stride[1], column_stride = a.image_stride[3];
+  const bool pixelwise = column_stride != 1 && packed.pixel == 4;
+  for (int64_t y = 0; y < a.height; ++y) {
+    const E* from = image + y * a.image_stride[2];
+    T* row = to + (y + 1) * packed.row;
+    for (int64_t e = 0; e < packed.pixel; ++e) row[e] = 0;
+    row += packed.pixel;
+    for (int64_t x = 0; x < a.width && pixelwise; ++x) {
+      const E* pixel = from + x * column_stride;
+      for (int64_t c = 0; c < 4; ++c) {
+        row[4 * x + c] = c < a.channels ? load<T>(pixel + c * channel_stride) : kBeyond;
+      }
+    }
+    for (int64_t first = 0; first < a.channels && !pixelwise; first += 4) {
+      // Four channels as planes. A plane points into the image if it can be read as it is, and to a
+      // converted copy otherwise.
+      const T* plane[4];
+      for (int64_t c = 0; c < 4; ++c) {
+        T* copy = planes + c * a.width;
+        plane[c] = copy;
+        if (first + c >= a.channels) {
+          for (int64_t x = 0; x < a.width; ++x) copy[x] = kBeyond;
+          continue;
+        }
+        const E* source = from + (first + c) * channel_stride;
+        if constexpr (sizeof(E) == sizeof(T)) {
+          if (column_stride == 1) {
+            plane[c] = source;
+            continue;
+          }
+        }
+        for (int64_t x = 0; x < a.width; ++x) copy[x] = load<T>(source + x * column_stride);
+      }
+      if (packed.pixel == 4) {
+        interleave(plane, a.width, row);
+      } else {
+        for (int64_t x = 0; x < a.width; ++x) {
+          for (int64_t c = 0; c < 4; ++c) row[x * packed.pixel + first + c] = plane[c][x];
+        }
+      }
+    }
+    row += a.width * packed.pixel;
+    for (int64_t e = 0; e < 2 * packed.pixel; ++e) row[e] = 0;
+  }
+  for (int64_t e = 0; e < packed.row; ++e) to[e] = 0;
+  for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
+}
+
+// Interpolates four channels of a point, and calls write(e, v) for the channels from e on. The
+// arguments are the upper left and the lower left pixel; their right neighbours follow them in
+// memory.
+template <typename T, typename Write>
+inline void interpolate(const T* pixel, const T* below, T right, T lower, Write write) {
+  using V = Piece<T>;
+#pragma GCC unroll 2
+  for (int e = 0; e < 4; e += kCount<V>) {
+    write(e, bilinear(load<V>(pixel + e), load<V>(pixel + 4 + e), load<V>(below + e),
+                      load<V>(below + 4 + e), splat<V>(right), splat<V>(lower)));
+  }
+}
+
+// Interpolates two points in a register of 256 bits. One load takes a pixel and its right
+// neighbour.
+template <typename T>
+inline Vector<T, 8> interpolate_two(const T* pixels, const T* below, const int32_t* offset,
+                                    const T* right, const T* lower) {
+  using V = Vector<T, 8>;
+  const auto pair = [&](int k) {
+    const V down = splat<V>(lower[k]);
+    return between(load<V>(pixels + offset[k]), load<V>(below + offset[k]), 1 - down, down);
+  };
+  const V first = pair(0), second = pair(1);
+  const auto both = (V)splat<Vector<double, 4>>(load_bits<double>(right));
+  const V along = __builtin_shufflevector(both, both, 0, 0, 0, 0, 5, 5, 5, 5);
+  return between(even_quads(first, second), odd_quads(first, second), 1 - along, along);
+}
+
+// Interpolates four points in a register of 512 bits. It first takes two pairs of pixels and the
+// two pairs below them, then four pixels and their right neighbours. Loads and stores limit the
+// speed of a single point. Here one load brings the weights of four points, and one store writes
+// points that follow each other. The function is a template, because only tiers with such registers
+// have two_eights and pick.
+template <typename T>
+inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int32_t* offset,
+                                      const T* right, const T* lower) {
+  using V = Vector<T, 16>;
+  using Index = Vector<int32_t, 16>;
+  constexpr Index first_two = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
+  constexpr Index all = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+  const auto down = load<Vector<T, 4>>(lower), along = load<Vector<T, 4>>(right);
+  const V top = two_eights(pixels + offset[0], pixels + offset[1]);
+  const V bottom = two_eights(below + offset[0], below + offset[1]);
+  const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
+  const V bottom2 = two_eights(below + offset[2], below + offset[3]);
+  const auto mix = [](V a, V b, V t) { return between(a, b, 1 - t, t); };
+  const V pairs = mix(top, bottom, pick(down, first_two));
+  const V pairs2 = mix(top2, bottom2, pick(down, first_two + 2));
+  return mix(even_quads(pairs, pairs2), odd_quads(pairs, pairs2), pick(along, all));
+}
+
+// How samples are normalized: not at all, or as those of 8-bit pixels inside the image, or as those
+// of 8-bit pixels of which some may lie outside. The last of four channels is then the coverage.
+enum class Normalization { none, inside, border };
+
+template <Normalization how, typename V>
+inline V finished(V v, V scale, V offset) {
+  if constexpr (how == Normalization::none) {
+    return v;
+  } else if constexpr (how == Normalization::inside) {
+    return normalized(v, scale, offset);
+  } else {
+    return normalized(v, scale, offset, shuffle<[](int i) { return i | 3; }>(v, v));
+  }
+}
+
+// The output of a block of points: point k goes to to[target[k]]. room[k] is the number of values
+// from there to the end of the row of a token, but at most kRoom.
+constexpr int64_t kRoom = 16;
+struct Targets {
+  int32_t target[kBlock], room[kBlock];
+};
+
+// Samples `count` points of a packed image.
+//
+// A point stores four values even if it has fewer channels. The next point of the row comes later
+// and overwrites the excess. But the memory after a token may hold finished values, or another
+// thread may write there. So the last points of a token's last row, which begins at point
+// `last_row`, store only their own values.
+//
+// This is a separate function, so that all its values stay in registers.
+template <Normalization how, typename T>
+[[gnu::noinline]] void sample_points(const PolarSampleArgs<T>& a, const T* pixels, int64_t row,
+                                     const PackedPlaces<T>& places, int64_t last_row, int64_t count,
+                                     const Targets& targets, T* to) {
+  const T* below = pixels + row;
+  const int64_t channels = a.channels;
+  const int32_t *offset = places.offset, *target = targets.target, *room = targets.room;
+  const T *right = places.right, *lower = places.lower;
+  using V = Vector<T, 4>;
+  constexpr bool bytes = how != Normalization::none;
+  const V scale = bytes ? load<V>(a.pixel_scale) : V{};
+  const V shift = bytes ? load<V>(a.pixel_offset) : V{};
+  int64_t k = 0;
+  if constexpr (is_same_v<T, float> && kRegister == 64) {
+    const auto scales = repeat(scale), shifts = repeat(shift);
+    for (; k + 4 <= count; k += 4) {
+      const auto v = finished<how>(
+          interpolate_four(pixels, below, offset + k, right + k, lower + k), scales, shifts);
+      if (room[k] >= 4 * channels) {
+        store_quarters(to + target[k], v, channels);
+      } else {
+        scatter_quarters(to, v, target + k, channels);
+      }
+    }
+  }
+  const auto sample = [&](int64_t k, T* out) {
+    interpolate(pixels + offset[k], below + offset[k], right[k], lower[k], [&](int e, auto v) {
+      if constexpr (bytes) v = finished<how>(v, scale, shift);
+      store(out + e, v);
+    });
+  };
+  if constexpr (is_same_v<T, float> && kRegister == 32) {
+    const auto scales = repeat(scale), shifts = repeat(shift);
+    for (; k + 2 <= last_row; k += 2) {
+      const auto v = finished<how>(interpolate_two(pixels, below, offset + k, right + k, lower + k),
+                                   scales, shifts);
+      store(to + target[k], lower_half(v));
+      store(to + target[k + 1], upper_half(v));
+    }
+  }
+  for (; k + 4 <= last_row; k += 4) {
+#pragma GCC unroll 4
+    for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn]);
+  }
+  for (; k < count; ++k) {
+    if (k < last_row || (room[k] >= 4 && k + 4 <= count)) {
+      sample(k, to + target[k]);
+      continue;
+    }
+    T v[4];
+    sample(k, v);
+#pragma GCC unroll 4
+    for (int c = 0; c < 4; ++c) {
+      if (c < channels) to[target[k] + c] = v[c];
+    }
+  }
+}
+
+}  // namespace
+}  // namespace darswin
