@@ -46,12 +46,12 @@ def has_own_int8() -> bool:
     return has_vnni and cpu_capability() == "avx512"
 
 
-def packed_weights(linear: nn.Linear | QuantizedLinear) -> Tensor:
+def packed_weights(linear: Any) -> Tensor:
     """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
     weight = linear.weight.detach()
     bias = None if linear.bias is None else linear.bias.detach().float()
-    if isinstance(linear, QuantizedLinear):
-        return _PACK(weight, bias, linear.weight_scale.float(), *linear.activation)
+    if (taken := taken_by(linear)) is not None:
+        return _PACK(weight, bias, linear.weight_scale.float(), *taken)
     return _PACK(weight.float(), bias)
 
 
