@@ -8,9 +8,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.models.features import FeatureInfo
-from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
+from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.ops.checks import per_channel
+from darswin.utils.tasks import PixelTask
 from darswin.views import PlainView, Prepared
 from darswin.views.base import PerChannel, check_count
 

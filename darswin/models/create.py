@@ -7,10 +7,11 @@ from darswin.models.conv_unet import ConvUnet
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps, Format
-from darswin.models.pixel import PixelModel, PixelTask
+from darswin.models.pixel import PixelModel
 from darswin.models.registry import make, model_class, no_weights
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet
+from darswin.utils.tasks import PixelTask
 
 # The names of each class, for type checkers.
 DarSwinName = Literal[

@@ -13,9 +13,10 @@ from darswin.layers.transformer import Stage
 from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Encoder
-from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
+from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.models.swin import Swin
+from darswin.utils.tasks import PixelTask
 from darswin.views import Pair, Prepared
 
 EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
