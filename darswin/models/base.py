@@ -116,6 +116,7 @@ class Model(nn.Module, Generic[Result]):
             ValueError: the images have a wrong shape or are on another device than the model, or
                 the number of lenses is neither B nor 1.
         """
+        self._check_learning(prepared)
         images = self._checked(images)
         x = self.view.see(images, prepared, self.dtype)
         return self.forward_network(x, prepared, images)
@@ -149,6 +150,7 @@ class Model(nn.Module, Generic[Result]):
             TypeError: an argument is no tensor, has an unsupported dtype, or is missing.
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
+        self._check_learning(prepared)
         sampled = self.view.check_seen(sampled, prepared, self.in_chans)
         self._check_device("sampled", sampled)
         if self.view.in_pixels:
@@ -247,7 +249,7 @@ class Model(nn.Module, Generic[Result]):
 
     def _with_shape(self, images: Tensor) -> Tensor:
         images = check_images(images, channels=self.in_chans)
-        if self.in_chans not in (None, images.shape[1]):
+        if self.in_chans is not None and images.shape[1] != self.in_chans:
             last = images.shape[3] == self.in_chans
             advice = "; the channels come first: pass images.permute(0, 3, 1, 2)" if last else ""
             raise ValueError(
@@ -278,6 +280,17 @@ class Model(nn.Module, Generic[Result]):
             raise TypeError(
                 f"{name} must be uint8 or {self.dtype}, the dtype of the weights, "
                 f"got {images.dtype}"
+            )
+
+    def _check_learning(self, prepared: Prepared) -> None:
+        """ValueError if a step of training would not reach the position biases."""
+        if torch.compiler.is_compiling() or not (self.training and torch.is_grad_enabled()):
+            return
+        learned = any(self.get_parameter(name).requires_grad for name in self.no_weight_decay())
+        if learned and not any(table.grad_fn for of in prepared.tables for table in of):
+            raise ValueError(
+                "prepared was computed without gradients, so the position biases would not be "
+                "trained: in training, call prepare in every step"
             )
 
     def no_weight_decay(self) -> set[str]:

@@ -171,7 +171,8 @@ class Unet(PixelModel):
         self.in_chans, self.feature_info = encoder.in_chans, encoder.feature_info
         self.decoder = Decoder(encoder, decoder_depths)
         rows, columns = encoder.sizes[0].map_size
-        self.goes_back = EXPANSION * rows, EXPANSION * columns
+        # Pixels of a view go back in its size, since the head refines them before.
+        self.goes_back = self.view.in_pixels or (EXPANSION * rows, EXPANSION * columns)
         self.token_maps = self.feature_info.get("map_size") if places else ()
         self.places = nn.ModuleList(
             Linear(self.view.coordinates, channels, bias=False)

@@ -143,7 +143,9 @@ class PolarView(View):
         # The operator would normalize in float32, and it needs a mean.
         if dtype == torch.float64 or self.mean is None:
             images = self.floating(images, dtype)
-        return polar_sample(**self.arguments(images, prepared.points), layout=self.layout)
+        seen = polar_sample(**self.arguments(images, prepared.points), layout=self.layout)
+        # The operator makes float32 of uint8. Pixels go to a network as they are, tokens do not.
+        return seen.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else seen
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
         """The arguments with which `polar_sample` reads images (B, C, H, W) on a grid."""
@@ -206,8 +208,8 @@ class PolarView(View):
 
     def _split(self, back: bool | Pair) -> int:
         """The number of rings, per ring here, of the maps that go back."""
-        rings = self.map_size[0] if isinstance(back, bool) else back[0]
-        return rings // self.rings
+        in_own_size = self.in_pixels or isinstance(back, bool)  # other images are resized
+        return (self.map_size[0] if in_own_size else back[0]) // self.rings
 
     def _ray_channels(self, lens: Lens, size: Pair) -> Tensor:
         if self.in_pixels:

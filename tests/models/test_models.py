@@ -170,6 +170,34 @@ def test_errors_of_pixels_that_were_sampled_already():
         dense.run_sampled(dense.sample(images, prepared), prepared)
 
 
+@cases
+def test_a_preparation_without_gradients_is_refused_in_training(case):
+    model, images, lenses = made(case)
+    size = tuple(images.shape[2:])
+    with torch.no_grad():
+        prepared = model.prepare(lenses, size)
+        sampled = model.sample(images, prepared)
+    runs = (
+        lambda prepared: model.run(images, prepared),
+        lambda prepared: model.run_sampled(sampled, prepared, images),
+    )
+    has_biases = bool(model.no_weight_decay())
+    assert has_biases == (case != "conv_unet_nano")
+    for run in runs:
+        run(prepared)
+        model.train()
+        run(model.prepare(lenses, size))
+        with torch.no_grad():
+            run(prepared)
+        if has_biases:
+            with pytest.raises(ValueError, match="without gradients, so the position biases would"):
+                run(prepared)
+        for name in model.no_weight_decay():
+            model.get_parameter(name).requires_grad_(False)
+        run(prepared)
+        model.requires_grad_(True).eval()
+
+
 @torch.no_grad()
 @cases
 def test_the_dtype_of_pixels_that_were_sampled_already(case):

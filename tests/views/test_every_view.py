@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from darswin import create_model
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical
 from darswin.models import LensAdapter, Swin
 from darswin.views import PolarView, View, list_views, make_view, register_view
@@ -125,6 +126,36 @@ def test_an_adapter_and_a_swin_see_every_view(name):
         assert adapter.uses_lens == (name != "none")
     model = Swin(4, depths=(1, 1), num_heads=(1, 2), embed_dim=8, image_size=32, view=name).eval()
     assert model(images[..., :32, :32], Equidistant(14.0, 1.2)).shape == (2, 4)
+
+
+@torch.no_grad()
+@every_view
+def test_a_unet_sees_every_view_and_brings_its_result_back(name):
+    options = dict(image_size=32, patch_size=2, window=(2, 2), task="distance", rays=True)
+    for skip_width in (32, 0):
+        model = create_model("swin_unet_nano", view=name, skip_width=skip_width, **options).eval()
+        lens, images = LENSES["two"], torch.rand(2, 3, 32, 32)
+        prepared = model.prepare(lens, (32, 32))
+        result = model.run(images, prepared)
+        assert result.shape == (2, 1, 32, 32) and result.isfinite().all()
+        assert torch.equal(model.run_sampled(model.sample(images, prepared), prepared), result)
+
+
+@torch.no_grad()
+@every_view
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float64])
+def test_networks_of_every_dtype_get_frames_of_uint8_in_their_dtype(name, dtype):
+    frames, lens = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8), Equidistant(14.0, 1.2)
+    conv = nn.Conv2d(3, 5, 3, padding=1)
+    for model in (
+        LensAdapter(conv, 32, view=name, mean=0.4, std=0.2),
+        Swin(4, depths=(1, 1), num_heads=(1, 2), embed_dim=8, image_size=32, view=name),
+    ):
+        model = model.to(dtype).eval()
+        prepared = model.prepare(lens, (32, 32))
+        sampled, result = model.sample(frames, prepared), model(frames, lens)
+        assert sampled.dtype == result.dtype == dtype
+        assert torch.equal(model.run_sampled(sampled, prepared), result)
 
 
 def test_a_view_of_ones_own_has_a_name():
