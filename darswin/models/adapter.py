@@ -95,12 +95,12 @@ class LensAdapter(Model[Any]):
 
         return pytree.tree_map(to_images, results)
 
-    def _check_dtype(self, images: Tensor) -> None:
+    def _check_dtype(self, name: str, images: Tensor) -> None:
         # The network may take other types of floating point than those of its weights.
         taken = (torch.uint8,) if self.mean is not None else ()
         if not (images.is_floating_point() or images.dtype in taken):
             hint = "" if taken else "; with mean and std, an adapter takes uint8 too"
-            raise TypeError(f"images must be in floating point, got {images.dtype}{hint}")
+            raise TypeError(f"{name} must be in floating point, got {images.dtype}{hint}")
 
     def _check_device(self, name: str, images: Tensor) -> None:
         """No check: the network may move its images itself."""

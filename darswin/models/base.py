@@ -151,6 +151,9 @@ class Model(nn.Module, Generic[Result]):
         """
         sampled = self.view.check_seen(sampled, prepared, self.in_chans)
         self._check_device("sampled", sampled)
+        if self.view.in_pixels:
+            self._check_dtype("sampled", sampled)
+            sampled = self.view.floating(sampled, self.dtype)
         if not self.refines_with_images:
             images = None
         elif images is None:
@@ -229,7 +232,7 @@ class Model(nn.Module, Generic[Result]):
         Warns once if their values cannot be normalized ones.
         """
         images = self._with_shape(images)
-        self._check_dtype(images)
+        self._check_dtype("images", images)
         if not torch.compiler.is_compiling() and self._looks and images.is_floating_point():
             self._looks -= 1
             largest = _largest(images)
@@ -266,14 +269,14 @@ class Model(nn.Module, Generic[Result]):
                 f'pass {name}.to("{weight.device}")'
             )
 
-    def _check_dtype(self, images: Tensor) -> None:
-        """TypeError unless images are uint8, have the model's dtype, or autocast converts them."""
+    def _check_dtype(self, name: str, images: Tensor) -> None:
+        """TypeError unless pixels are uint8, have the model's dtype, or autocast converts them."""
         if images.dtype in (torch.uint8, self.dtype):
             return
         autocast = torch.is_autocast_enabled(images.device.type)
         if not autocast or torch.float64 in (images.dtype, self.dtype):
             raise TypeError(
-                f"images must be uint8 or {self.dtype}, the dtype of the weights, "
+                f"{name} must be uint8 or {self.dtype}, the dtype of the weights, "
                 f"got {images.dtype}"
             )
 

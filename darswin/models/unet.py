@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -227,8 +227,10 @@ def _resized(maps: Tensor, size: Sequence[int]) -> Tensor:
 
 @register_model("darswin_unet_a", kind=Unet, variant="A", presets=_POLAR)
 @register_model("darswin_unet_ra", kind=Unet, variant="RA", presets=_POLAR)
-def darswin_unet(**options: Any) -> Unet:
-    """A `Unet` with a DarSwin encoder, from the options of both."""
+def darswin_unet(view: Literal["polar"] = "polar", **options: Any) -> Unet:
+    """A `Unet` with a DarSwin encoder, from the options of both. Older files name its view."""
+    if view != "polar":
+        raise ValueError(f"view must be 'polar', got {view!r}: a swin_unet takes other views")
     return _unet(DarSwin, options)
 
 

@@ -220,12 +220,13 @@ class PixelView(View):
     ) -> Prepared:
         if self.uses_lens or rays:
             check_lens(lens, size)
+        points = self.image_points(lens, size)
         return Prepared(
             size,
-            self.image_points(lens, size),
+            points,
             self.view_points(lens, size) if back else None,
             ray_channels(*self.pixel_rays(lens, size)) if rays else None,
-            [_centers(of_map, lens) for of_map in maps],
+            [_centers(of_map, None if points is None else points.device) for of_map in maps],
         )
 
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -255,9 +256,8 @@ class PixelView(View):
         return seen
 
 
-def _centers(size: Pair, lens: Lens | None) -> Tensor:
+def _centers(size: Pair, device: torch.device | None) -> Tensor:
     """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
-    device = None if lens is None else lens.theta_max.device
     y, x = ((2 * torch.arange(side, device=device) + 1) / side - 1 for side in size)
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 

@@ -170,6 +170,25 @@ def test_errors_of_pixels_that_were_sampled_already():
         dense.run_sampled(dense.sample(images, prepared), prepared)
 
 
+@torch.no_grad()
+@cases
+def test_the_dtype_of_pixels_that_were_sampled_already(case):
+    model, images, lenses = made(case, mean=MEAN, std=STD)
+    prepared = model.prepare(lenses, tuple(images.shape[2:]))
+    sampled = model.sample(images, prepared)
+    for dtype in (torch.int32, torch.float16, torch.float64, torch.bfloat16):
+        if model.view.in_pixels or dtype in (torch.int32, torch.float16):
+            with pytest.raises(TypeError, match=rf"sampled must be .*, got {dtype}"):
+                model.run_sampled(sampled.to(dtype), prepared, images)
+        else:
+            found = model.run_sampled(sampled.to(dtype), prepared, images)
+            assert_close(found, model.run(images, prepared), 0.1)
+    if model.view.in_pixels:  # such as a camera's undistorted frames
+        frames = torch.randint(256, sampled.shape, dtype=torch.uint8)
+        expected = model.run_sampled(model.normalize(frames), prepared)
+        assert_equal(model.run_sampled(frames, prepared), expected)
+
+
 OPTIONS = [
     ("darswin_a_nano", dict(variant="RA", rings=8, sectors=16)),
     ("darswin_a_nano", dict(position_bias="angular")),
@@ -315,7 +334,8 @@ def test_the_images_and_the_lens_that_it_takes(case):
             model(torch.zeros(1, 3, side, side + 8), lenses[:1])
     if case in IGNORE_THE_LENS:
         model.requires_grad_(False)
-        assert torch.equal(model(images, lenses), model(images))
+        for lens in (lenses, "no lens at all"):
+            assert torch.equal(model(images, lens), model(images))
         return
     with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
         model(images)

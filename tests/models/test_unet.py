@@ -230,6 +230,14 @@ def test_heads_and_depths_are_options():
     assert far.get_classifier() is far.head is far.distance_head
 
 
+@pytest.mark.parametrize("name", ["darswin_unet_a_nano", "darswin_unet_ra_nano"])
+def test_older_files_name_the_view_of_darswin(name):
+    model, older = (create_model(name, **options) for options in ({}, dict(view="polar")))
+    assert model.state_dict().keys() == older.state_dict().keys()
+    with pytest.raises(ValueError, match="view must be 'polar', got 'square': a swin_unet takes"):
+        create_model(name, view="square")
+
+
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("classifier", "unet", "options"),
