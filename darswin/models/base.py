@@ -247,7 +247,7 @@ class Model(nn.Module, Generic[Result]):
 
     def _with_shape(self, images: Tensor) -> Tensor:
         images = check_images(images, channels=self.in_chans)
-        if self.in_chans not in (None, images.shape[1]):
+        if self.in_chans is not None and images.shape[1] != self.in_chans:
             last = images.shape[3] == self.in_chans
             advice = "; the channels come first: pass images.permute(0, 3, 1, 2)" if last else ""
             raise ValueError(

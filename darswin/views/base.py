@@ -275,7 +275,7 @@ def check_images(
 def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
     """What a view of (H, W) pixels sees, as (B, C, H, W); TypeError or ValueError otherwise."""
     seen = check_images(seen, channels=channels)
-    if channels not in (None, seen.shape[1]):
+    if channels is not None and seen.shape[1] != channels:
         raise ValueError(f"sampled must have {channels} channels, got {seen.shape[1]}")
     if seen.shape[2:] != size:
         raise ValueError(
