@@ -21,7 +21,7 @@ from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
 from darswin.utils.quiet import quiet_export
-from darswin.views import Pair
+from darswin.views.base import Pair
 
 __all__ = ["export_onnx", "export_package", "export_program"]
 

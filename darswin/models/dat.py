@@ -15,8 +15,7 @@ from darswin.models.registry import register_model
 from darswin.models.stages import StageSizes
 from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
-from darswin.views import Pair
-from darswin.views.base import PerChannel
+from darswin.views.base import Pair, PerChannel
 
 
 class DeformableAttention(nn.Module):
