@@ -23,8 +23,8 @@ from darswin.lens.spacing import check_tan
 from darswin.models.darswin import DarSwin
 from darswin.models.stages import StageSizes
 from darswin.ops.reference import ranks
-from darswin.views import Pair, PolarGrid, PolarView
-from darswin.views.base import PerChannel
+from darswin.views import PolarGrid, PolarView
+from darswin.views.base import Pair, PerChannel
 
 
 class OfficialPolynomial(Lens, register=False):

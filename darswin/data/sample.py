@@ -10,11 +10,9 @@ from darswin.lens import Lens
 class Sample(NamedTuple):
     """A picture with its target and its lens.
 
-    Attributes:
-        image: (H, W, C) uint8.
-        target: (H, W), a label of each pixel, uint8 with `IGNORE`, or its distance, float32 metres
-            along the ray with 0 for unknown; the id of the picture's class; or None.
-        lens: one lens, with this image_size.
+    The image is (H, W, C) uint8, and the lens is one lens with this image_size. The target is the
+    label of each pixel, (H, W) uint8 with `IGNORE`; or its distance along the ray, (H, W) float32
+    metres with 0 for unknown; or the id of the picture's class; or None.
     """
 
     image: np.ndarray

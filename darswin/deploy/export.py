@@ -21,7 +21,7 @@ from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
 from darswin.utils.quiet import quiet_export
-from darswin.views import Pair
+from darswin.views.base import Pair
 
 __all__ = ["export_onnx", "export_package", "export_program"]
 
@@ -50,7 +50,9 @@ class _OfTensors(nn.Module):
         super().__init__()
         self.model, self.lens, self.size = model, lens, size
         self.sampled, self.any_strides = sampled, any_strides
-        self.prepared = self._prepare({}) if not tensors else None
+        # Copies: torch.export warns of constants that are views of weights.
+        prepared = self._prepare({}) if not tensors else None
+        self.prepared = pytree.tree_map_only(Tensor, torch.clone, prepared)
         # torch.export finds the names of the inputs in the signature of `forward`.
         inputs = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in pixels]
         inputs += [Parameter(name, Parameter.KEYWORD_ONLY) for name in tensors]

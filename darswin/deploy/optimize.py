@@ -21,7 +21,8 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
-from darswin.views import Pair, Prepared
+from darswin.views import Prepared
+from darswin.views.base import Pair
 
 __all__ = ["optimize"]
 

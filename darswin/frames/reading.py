@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 from darswin.models.base import Model
-from darswin.views import Pair, PolarGrid, PolarView, View
-from darswin.views.base import check_lens
+from darswin.views import PolarGrid, PolarView, View
+from darswin.views.base import Pair, check_lens
 
 
 class Reading(NamedTuple):

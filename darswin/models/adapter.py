@@ -10,8 +10,8 @@ from torch.utils import _pytree as pytree
 from darswin.lens.spacing import Spacing
 from darswin.models.base import Model
 from darswin.ops.checks import as_int, per_channel
-from darswin.views import Pair, Prepared, View, make_view
-from darswin.views.base import PerChannel
+from darswin.views import Prepared, View, make_view
+from darswin.views.base import Pair, PerChannel
 
 
 class LensAdapter(Model[Any]):

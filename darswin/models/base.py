@@ -14,8 +14,8 @@ from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
 from darswin.ops._library import transformed
 from darswin.ops.checks import readable
-from darswin.views import Pair, Prepared, View
-from darswin.views.base import PerChannel, check_images
+from darswin.views import Prepared, View
+from darswin.views.base import Pair, PerChannel, check_images
 
 Result = TypeVar("Result", covariant=True)
 

@@ -13,8 +13,8 @@ from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StageSizes, stage_sizes
 from darswin.ops.checks import per_channel
-from darswin.views import Pair, PolarView
-from darswin.views.base import PerChannel
+from darswin.views import PolarView
+from darswin.views.base import Pair, PerChannel
 from darswin.views.polar import Placement
 
 # Models of the same size have the same number of tokens.

@@ -15,8 +15,7 @@ from darswin.models.registry import register_model
 from darswin.models.stages import StageSizes
 from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
-from darswin.views import Pair
-from darswin.views.base import PerChannel
+from darswin.views.base import Pair, PerChannel
 
 
 class DeformableAttention(nn.Module):
@@ -106,10 +105,9 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
 class DAT(Swin):
     """The Deformable Attention Transformer: Swin with deformable attention in some blocks.
 
+    The arguments that are not listed here are those of `Swin`.
+
     Args:
-        num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate, image_size,
-            patch_size, window, view, max_fov, spacing, theta_max, mean, std: the arguments of
-            `Swin`.
         blocks: a string for each stage with the kinds of its blocks, which repeats: "L" has window
             attention, "S" has shifted windows, "D" has deformable attention.
         groups: for each stage, the number of groups of heads in deformable attention. The heads of

@@ -12,7 +12,8 @@ from darswin.lens import Lens
 from darswin.models.base import Model, init_weights
 from darswin.models.features import FeatureInfo, feature_info, take_indices
 from darswin.models.stages import StageSizes
-from darswin.views import Pair, Prepared
+from darswin.views import Prepared
+from darswin.views.base import Pair
 
 Format = Literal["NHWC", "NCHW"]
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from darswin.models.stages import StageSizes
-from darswin.views import Pair
+from darswin.views.base import Pair
 
 
 class FeatureInfo(list[dict[str, Any]]):

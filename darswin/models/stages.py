@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from darswin.ops.checks import check_pair
-from darswin.views import Pair
+from darswin.views.base import Pair
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StageSizes, stage_sizes
 from darswin.ops.checks import per_channel
-from darswin.views import Pair, make_view
-from darswin.views.base import PerChannel
+from darswin.views import make_view
+from darswin.views.base import Pair, PerChannel
 
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 

@@ -17,7 +17,8 @@ from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.models.swin import Swin
 from darswin.utils.tasks import PixelTask
-from darswin.views import Pair, Prepared
+from darswin.views import Prepared
+from darswin.views.base import Pair
 
 EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
 

@@ -91,10 +91,8 @@ def call(
 # -- derivatives -----------------------------------------------------------------------------------
 
 
-def register_gradients(
-    name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
-) -> None:
-    """Registers the autograd of an operator, and `fake` or a default as the fake of its backward.
+def register_gradients(name: str, groups: dict[int, int]) -> None:
+    """Registers the autograd of an operator, and the fake of its backward.
 
     `groups` maps the index of each argument that has a gradient to its group, in the order of the
     results of backward. The backward operator takes the operator's first arguments, the gradient
@@ -129,7 +127,7 @@ def register_gradients(
 
     _register_autograd(getattr(operators, name).default, f"darswin.{name}", gradients)
     _register_autograd(backward, f"{name}'s backward", second_derivative)
-    torch.library.register_fake(f"darswin::{name}_backward", fake or fake_backward)
+    torch.library.register_fake(f"darswin::{name}_backward", fake_backward)
 
 
 def _register_autograd(operator: OpOverload, title: str, gradients: Callable) -> None:

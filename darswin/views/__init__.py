@@ -1,7 +1,6 @@
 """What a network sees of a picture through a lens: one file for each view, registered by name."""
 
 from darswin.views.base import (
-    Pair,
     PixelGrid,
     PolarGrid,
     Prepared,
@@ -16,7 +15,6 @@ from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.square import SquareView
 
 __all__ = [
-    "Pair",
     "PerspectiveView",
     "PixelGrid",
     "PlainView",

@@ -59,18 +59,15 @@ class PixelGrid(NamedTuple):
 class Prepared(NamedTuple):
     """Everything of N lenses that a view and a network need, for images of one size.
 
-    Attributes:
-        size: (H, W) of the images.
-        points: the points at which the view reads the images: a `PolarGrid`, or pixels
-            (N, H', W', 2). None means that the view is the images.
-        back: the points of the view that the pixels of the images show: a `PixelGrid`, or pixels
-            (N, H, W, 2). None means that the view is the images, or that the way back was not asked
-            for.
-        rays: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
-            the pixels of the view, or of the images if the view has no pixels; 0 where no ray
-            lands.
-        tokens: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
-        tables: for each stage of a network, the position biases of its blocks; a view has none.
+    - `size`: (H, W) of the images.
+    - `points`: the points at which the view reads the images: a `PolarGrid`, or pixels
+      (N, H', W', 2). None means that the view is the images.
+    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or pixels
+      (N, H, W, 2). None means that the view is the images, or that the way back was not asked for.
+    - `rays`: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
+      the pixels of the view, or of the images if the view has no pixels; 0 where no ray lands.
+    - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
+    - `tables`: for each stage of a network, the position biases of its blocks; a view has none.
     """
 
     size: Pair

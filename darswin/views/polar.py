@@ -201,7 +201,7 @@ class PolarView(View):
 
     @property
     def map_size(self) -> Pair:
-        """The size of what the network sees: (R, A), or (R·S_r, A·S_φ) for an image."""
+        """What the network sees has this size, (R, A), or (R·S_r, A·S_φ) for an image."""
         if not self.in_pixels:
             return self.rings, self.sectors
         return self.rings * self.samples[0], self.sectors * self.samples[1]

@@ -239,7 +239,7 @@ PROGRAMS: dict[str, Callable] = {
 def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
     scope: dict = {}
     for block in blocks(ROOT / "docs/howto/use.md"):
-        if block.language == "python" and "PolarSample" not in block.text:
+        if block.language == "python" and "PolarView(" not in block.text:
             run_python(block.text, scope)
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
 

@@ -12,7 +12,7 @@ from figures import on_a_phone
 from matplotlib.figure import Figure
 from PIL import Image
 
-from darswin import PolarSample, create_model
+from darswin import PolarView, create_model
 from darswin.lens import Equidistant
 from darswin.viz import plot
 from darswin.viz.pixels import draw_predictions
@@ -49,7 +49,7 @@ def record(path: str) -> dict:
 
 
 def draw_lens() -> Figure:
-    sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
+    sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
     return plot.draw_lens(PICTURE, WIDE, sampler, perspective((60, 80), 1.9), "a view")
 
 

@@ -8,7 +8,7 @@ import torch
 from helpers import network, side_of
 from torch import nn
 
-from darswin import PolarSample, list_models, optimize
+from darswin import PolarView, list_models, optimize
 from darswin.deploy.export import export_program
 from darswin.lens import Spherical
 from darswin.models import LensAdapter
@@ -177,7 +177,7 @@ def test_channels_come_first_and_a_batch_before_them(kind):
 
 @pytest.mark.parametrize("kind", ["layer", "adapter"])
 def test_what_does_not_know_its_channels_finds_them_by_the_lens(kind):
-    layer = adapter() if kind == "adapter" else PolarSample(4, 8, (2, 2))
+    layer = adapter() if kind == "adapter" else PolarView(4, 8, (2, 2))
     images, lens = torch.rand(2, 24, 32, 3), Spherical(0.5, 9.0, 1.2, image_size=(24, 32))
     with pytest.raises(
         ValueError, match=r"of \(32, 3\); the channels come first: pass images\.perm"

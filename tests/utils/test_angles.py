@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from darswin import PolarSample, create_model
+from darswin import PolarView, create_model
 from darswin.data import WideAngle
 from darswin.data.lens_distributions import PolynomialLenses, SphericalLenses
 from darswin.models import LensAdapter
@@ -29,7 +29,7 @@ RNG = np.random.default_rng(0)
         (lambda: SphericalLenses(0.2, 0.3).draw(RNG, 170, 32), "fov", 170),
         (lambda: PolynomialLenses().draw(RNG, 170, 32), "fov", 170),
         (lambda: WideAngle(None, SphericalLenses(0, 1), fov=170), "fov", 170),
-        (lambda: PolarSample(4, 8, (2, 2), theta_max=85), "theta_max", 85),
+        (lambda: PolarView(4, 8, (2, 2), theta_max=85), "theta_max", 85),
         (lambda: LensAdapter(torch.nn.Identity(), 32, theta_max=85), "theta_max", 85),
         (lambda: create_model("darswin_a_nano", theta_max=85), "theta_max", 85),
         (lambda: create_model("swin_unet_adapted_nano", theta_max=85), "theta_max", 85),

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from darswin import PolarSample
+from darswin import PolarView
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.viz.plot import (
     FORMATS,
@@ -23,7 +23,7 @@ from darswin.viz.plot import (
 )
 from darswin.viz.views import equirectangular, perspective
 
-SAMPLER = PolarSample(rings=4, sectors=8, samples=(3, 2), layout="image")
+SAMPLER = PolarView(rings=4, sectors=8, samples=(3, 2), layout="image")
 ROUND = Spherical.from_fov(0.4, 2.6, 16.0)
 BENT = Mei(
     2.0, 40.0, (0.05, 1.5), 1.7, affine=[[1.0, 0.1], [0.0, 0.8]], tangential=(0.02, -0.03)
@@ -77,7 +77,7 @@ def test_draw_samples_is_a_part_of_the_grid():
 @pytest.mark.parametrize("shape", [(32, 32), (32, 32, 3)])
 def test_draw_polar_is_what_the_layer_samples(shape):
     image = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
-    for sampler in (SAMPLER, PolarSample(4, 8, (3, 2), jitter=1.0, mean=0.5)):
+    for sampler in (SAMPLER, PolarView(4, 8, (3, 2), jitter=1.0, mean=0.5)):
         (axes,) = drawn(draw_polar, image, ROUND, sampler)
         channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
         expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).expand(-1, -1, 3)
