@@ -208,8 +208,9 @@ class PolarView(View):
 
     def _split(self, back: bool | Pair) -> int:
         """The number of rings, per ring here, of the maps that go back."""
-        in_own_size = self.in_pixels or isinstance(back, bool)  # other images are resized
-        return (self.map_size[0] if in_own_size else back[0]) // self.rings
+        if self.in_pixels or isinstance(back, bool):  # images of another size are resized
+            return self.map_size[0] // self.rings
+        return back[0] // self.rings
 
     def _ray_channels(self, lens: Lens, size: Pair) -> Tensor:
         if self.in_pixels:
