@@ -107,9 +107,10 @@ struct ByteBlock {
   }
 };
 
-// Returns channel c of a sample at the border or outside.
-inline float border_sample(const ByteImage& image, int64_t column, int64_t row, float right,
-                           float lower, int64_t c) {
+// Returns channel c of a sample at the border or outside. Inlined, it would slow down the loop over
+// all points, of which few are there.
+[[gnu::noinline]] float border_sample(const ByteImage& image, int64_t column, int64_t row,
+                                      float right, float lower, int64_t c) {
   const auto interpolate = [&](auto value) {
     const auto at = [&](int64_t y, int64_t x) {
       const bool inside = y >= 0 && y < image.height && x >= 0 && x < image.width;
