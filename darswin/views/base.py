@@ -62,7 +62,7 @@ class Prepared(NamedTuple):
     - `size`: (H, W) of the images.
     - `points`: the points at which the view reads the images: a `PolarGrid`, or pixels
       (N, H', W', 2). None means that the view is the images.
-    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or pixels
+    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or points
       (N, H, W, 2). None means that the view is the images, or that the way back was not asked for.
     - `rays`: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
       the pixels of the view, or of the images if the view has no pixels; 0 where no ray lands.
@@ -252,6 +252,9 @@ class PixelView(View):
             check_count(prepared.points.shape[0], seen)
         return seen
 
+    def extra_repr(self) -> str:
+        return f"size={self.size}"
+
 
 def _centers(size: Pair, device: torch.device | None) -> Tensor:
     """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
@@ -313,7 +316,10 @@ _Make = TypeVar("_Make", bound=Callable[..., View])
 
 
 def register_view(name: str) -> Callable[[_Make], _Make]:
-    """Registers the decorated class or function, which makes the view: `make(size, **options)`."""
+    """Registers the decorated class or function, which makes the view.
+
+    It is called `make((H', W'), mean=…, std=…, **options)`.
+    """
 
     def register(make: _Make) -> _Make:
         _VIEWS[name] = make
@@ -347,9 +353,10 @@ def make_view(
     """
     if name not in _VIEWS:
         raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
-    given = {option: value for option, value in options.items() if value is not None}
+    make, given = _VIEWS[name], {k: value for k, value in options.items() if value is not None}
+    given |= dict(mean=mean, std=std)
     try:
-        inspect.signature(_VIEWS[name]).bind(size, **given)
+        inspect.signature(make).bind(size, **given)
     except TypeError as error:
         raise TypeError(f"the view {name!r} has no such option: {error}") from error
-    return _VIEWS[name](size, mean=mean, std=std, **given)
+    return make(size, **given)
