@@ -1,7 +1,7 @@
 """The seam between lenses and networks: what a view is, and views by name."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -88,6 +88,10 @@ class View(nn.Module):
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`, one number or one for
             each channel. None refuses uint8 images. Images in floating point are not normalized.
 
+    Raises:
+        ValueError: one of mean and std is missing, their numbers of channels differ, or std is not
+            above 0.
+
     Attributes:
         uses_lens: False if the view ignores its lens, which may then be None.
         in_pixels: True if the network sees pixels (B, C, H', W'), False for tokens (B, R, A, S).
@@ -102,6 +106,9 @@ class View(nn.Module):
         super().__init__()
         if (mean is None) != (std is None):
             raise ValueError(f"mean and std must be given together, got {mean} and {std}")
+        if mean is not None and std is not None:
+            channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
+            per_channel("mean", mean, channels), per_channel("std", std, channels)
         self.mean, self.std = mean, std
 
     def prepare(

@@ -110,6 +110,20 @@ def test_frames_of_uint8_are_normalized(name):
         refuses(frames, lens)
 
 
+@every_view
+@pytest.mark.parametrize(
+    ("mean", "std", "message"),
+    [
+        (0.5, 0.0, r"std must be positive, got 0\.0"),
+        ((0.1, 0.2), (0.1, 0.2, 0.3), r"mean must be one number or one per channel \(3\)"),
+        (None, 0.5, "mean and std must be given together, got None and 0.5"),
+    ],
+)
+def test_wrong_statistics_are_refused_before_any_image(name, mean, std, message):
+    with pytest.raises(ValueError, match=message):
+        make_view(name, (16, 16), mean=mean, std=std)
+
+
 @torch.no_grad()
 @every_view
 def test_an_adapter_and_a_swin_see_every_view(name):
