@@ -25,8 +25,8 @@ from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.saving import ModelCard
 from darswin.utils.files import replace_file
-from darswin.views import Prepared
 from darswin.utils.tasks import Fit
+from darswin.views import Prepared
 from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
@@ -63,7 +63,9 @@ class Answers:
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0  # spent in the network
         self._lens: Lens | None = None  # of the queue
-        self._prepared: dict[int, tuple[Lens, Prepared, FullSize | None]] = {}  # by a lens's identity
+        self._prepared: dict[
+            int, tuple[Lens, Prepared, FullSize | None]
+        ] = {}  # by a lens's identity
         self._queue: list[Request] = []
         self._warned = False
 
