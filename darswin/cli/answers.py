@@ -63,9 +63,7 @@ class Answers:
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0  # spent in the network
         self._lens: Lens | None = None  # of the queue
-        self._prepared: dict[
-            int, tuple[Lens, Prepared, FullSize | None]
-        ] = {}  # by a lens's identity
+        self._prepared: dict[int, tuple[Lens, Prepared, FullSize | None]] = {}  # by identity
         self._queue: list[Request] = []
         self._warned = False
 
