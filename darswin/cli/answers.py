@@ -26,6 +26,7 @@ from darswin.models.pixel import PixelModel
 from darswin.models.saving import ModelCard
 from darswin.utils.files import replace_file
 from darswin.utils.tasks import Fit
+from darswin.views import Prepared
 from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
@@ -62,7 +63,7 @@ class Answers:
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0  # spent in the network
         self._lens: Lens | None = None  # of the queue
-        self._prepared: dict[int, tuple[Lens, Any, FullSize | None]] = {}  # by a lens's identity
+        self._prepared: dict[int, tuple[Lens, Prepared, FullSize | None]] = {}  # by identity
         self._queue: list[Request] = []
         self._warned = False
 
@@ -128,7 +129,7 @@ class Answers:
         """The mapping to the pixels of the lens's pictures, if the predictions need it."""
         return None
 
-    def _run(self, images: Tensor, prepared: Any) -> Tensor:
+    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         """The network's output (B, …) for images (B, C, h, w)."""
         raise NotImplementedError
 
@@ -145,7 +146,7 @@ class ClassAnswers(Answers):
         super().__init__(fast(model, card), card)
         self.top = top
 
-    def _run(self, images: Tensor, prepared: Any) -> Tensor:
+    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.model.run(images, prepared).softmax(-1)
 
     def _answer(self, request: Request, output: Tensor, full: Any) -> dict[str, Any]:
@@ -171,7 +172,7 @@ class PixelAnswers(Answers):
     def _full_size(self, lens: Lens) -> FullSize:
         return FullSize(lens, self.card.size, framing_of(self.model, self.card))
 
-    def _run(self, images: Tensor, prepared: Any) -> Tensor:
+    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.model.run(images, prepared)
 
     def _answer(self, request: Request, output: Tensor, full: FullSize) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Any network that takes square images, or other pixels, behind any lens."""
 
-from collections.abc import Iterable
 from typing import Any, Literal
 
 import torch
@@ -9,7 +8,7 @@ from torch.utils import _pytree as pytree
 
 from darswin.lens.spacing import Spacing
 from darswin.models.base import Model
-from darswin.ops.checks import as_int, per_channel
+from darswin.ops.checks import as_int
 from darswin.views import Prepared, View, make_view
 from darswin.views.base import Pair, PerChannel
 
@@ -76,9 +75,6 @@ class LensAdapter(Model[Any]):
             self.view = view
         else:
             self.view = make_view(view, _pair(size), mean=mean, std=std, **options)
-            if mean is not None and std is not None:
-                channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
-                per_channel("mean", mean, channels), per_channel("std", std, channels)
         self.network, self.output = network, output
         self.goes_back = output == "pixels"
         if self.mean is None:

@@ -3,7 +3,9 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -31,13 +33,9 @@ def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, 
     Raises:
         ValueError: the file is no safetensors file, or its content is not what was written.
     """
-    check_is_file(path)
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as file:
+        metadata = file.metadata() or {}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     digest = metadata.pop(_DIGEST, None)
     if digest is not None and digest != _digest(tensors, metadata):
         raise ValueError(f"{path} is damaged: its content has another SHA-256 than when written")
@@ -46,16 +44,20 @@ def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, 
 
 def read_metadata(path: str | os.PathLike) -> dict[str, str]:
     """The metadata of a file. The tensors are neither read nor checked."""
+    with _opened(path) as file:
+        return file.metadata() or {}
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[Any]:
     check_is_file(path)
+    with open(path, "rb"):
+        pass  # the errors of `safe_open` do not name a folder
     try:
         with safe_open(path, "pt") as file:
-            return file.metadata() or {}
+            yield file
     except SafetensorError as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: str | os.PathLike, error: SafetensorError) -> ValueError:
-    return ValueError(f"{path} cannot be read as safetensors: {error}")
+        raise ValueError(f"{path} cannot be read as safetensors: {error}") from error
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:

@@ -2,6 +2,7 @@
 
 from darswin.views.base import (
     PixelGrid,
+    PixelView,
     PolarGrid,
     Prepared,
     View,
@@ -17,6 +18,7 @@ from darswin.views.square import SquareView
 __all__ = [
     "PerspectiveView",
     "PixelGrid",
+    "PixelView",
     "PlainView",
     "PolarGrid",
     "PolarSample",

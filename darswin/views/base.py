@@ -1,7 +1,7 @@
 """The seam between lenses and networks: what a view is, and views by name."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -62,7 +62,7 @@ class Prepared(NamedTuple):
     - `size`: (H, W) of the images.
     - `points`: the points at which the view reads the images: a `PolarGrid`, or pixels
       (N, H', W', 2). None means that the view is the images.
-    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or pixels
+    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or points
       (N, H, W, 2). None means that the view is the images, or that the way back was not asked for.
     - `rays`: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
       the pixels of the view, or of the images if the view has no pixels; 0 where no ray lands.
@@ -88,6 +88,10 @@ class View(nn.Module):
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`, one number or one for
             each channel. None refuses uint8 images. Images in floating point are not normalized.
 
+    Raises:
+        ValueError: one of mean and std is missing, their numbers of channels differ, or std is not
+            above 0.
+
     Attributes:
         uses_lens: False if the view ignores its lens, which may then be None.
         in_pixels: True if the network sees pixels (B, C, H', W'), False for tokens (B, R, A, S).
@@ -102,6 +106,9 @@ class View(nn.Module):
         super().__init__()
         if (mean is None) != (std is None):
             raise ValueError(f"mean and std must be given together, got {mean} and {std}")
+        if mean is not None and std is not None:
+            channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
+            per_channel("mean", mean, channels), per_channel("std", std, channels)
         self.mean, self.std = mean, std
 
     def prepare(
@@ -252,6 +259,9 @@ class PixelView(View):
             check_count(prepared.points.shape[0], seen)
         return seen
 
+    def extra_repr(self) -> str:
+        return f"size={self.size}"
+
 
 def _centers(size: Pair, device: torch.device | None) -> Tensor:
     """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
@@ -313,7 +323,10 @@ _Make = TypeVar("_Make", bound=Callable[..., View])
 
 
 def register_view(name: str) -> Callable[[_Make], _Make]:
-    """Registers the decorated class or function, which makes the view: `make(size, **options)`."""
+    """Registers the decorated class or function, which makes the view.
+
+    It is called `make((H', W'), mean=…, std=…, **options)`.
+    """
 
     def register(make: _Make) -> _Make:
         _VIEWS[name] = make
@@ -347,9 +360,10 @@ def make_view(
     """
     if name not in _VIEWS:
         raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
-    given = {option: value for option, value in options.items() if value is not None}
+    make, given = _VIEWS[name], {k: value for k, value in options.items() if value is not None}
+    given |= dict(mean=mean, std=std)
     try:
-        inspect.signature(_VIEWS[name]).bind(size, **given)
+        inspect.signature(make).bind(size, **given)
     except TypeError as error:
         raise TypeError(f"the view {name!r} has no such option: {error}") from error
-    return _VIEWS[name](size, mean=mean, std=std, **given)
+    return make(size, **given)

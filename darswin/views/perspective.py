@@ -53,4 +53,4 @@ class PerspectiveView(PixelView):
         return pixels.perspective_view(lens, self.size, self.max_fov)
 
     def extra_repr(self) -> str:
-        return f"size={self.size}, max_fov={self.max_fov:g}"
+        return f"{super().extra_repr()}, max_fov={self.max_fov:g}"

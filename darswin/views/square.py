@@ -52,6 +52,7 @@ class SquareView(PixelView):
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
+        """In [-1, 1] from edge to edge, and not in px."""
         return square_points(lens, size, self.spacing, self.theta_max)
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
@@ -63,4 +64,4 @@ class SquareView(PixelView):
 
     def extra_repr(self) -> str:
         edge = "" if self.theta_max is None else f", theta_max={self.theta_max:g}"
-        return f"size={self.size}, spacing={self.spacing!r}{edge}"
+        return f"{super().extra_repr()}, spacing={self.spacing!r}{edge}"

@@ -170,3 +170,11 @@ def test_an_entry_that_torch_would_not_read(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"m\.pth cannot .* m/data/0 is marked as a folder"):
         read_pickle(path)
+
+
+@pytest.mark.parametrize("read", [read_tensors, read_metadata])
+def test_a_folder_or_a_missing_file_is_named(read, tmp_path):
+    with pytest.raises(IsADirectoryError, match=re.escape(str(tmp_path))):
+        read(tmp_path)
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        read(tmp_path / "nothing.safetensors")

@@ -6,9 +6,9 @@ import torch.nn.functional as F
 from torch import nn
 
 from darswin import create_model
-from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical
+from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical, pixels
 from darswin.models import LensAdapter, Swin
-from darswin.views import PolarView, View, list_views, make_view, register_view
+from darswin.views import PixelView, PolarView, View, list_views, make_view, register_view
 from darswin.views.base import _VIEWS
 
 LENSES = {
@@ -110,6 +110,20 @@ def test_frames_of_uint8_are_normalized(name):
         refuses(frames, lens)
 
 
+@every_view
+@pytest.mark.parametrize(
+    ("mean", "std", "message"),
+    [
+        (0.5, 0.0, r"std must be positive, got 0\.0"),
+        ((0.1, 0.2), (0.1, 0.2, 0.3), r"mean must be one number or one per channel \(3\)"),
+        (None, 0.5, "mean and std must be given together, got None and 0.5"),
+    ],
+)
+def test_wrong_statistics_are_refused_before_any_image(name, mean, std, message):
+    with pytest.raises(ValueError, match=message):
+        make_view(name, (16, 16), mean=mean, std=std)
+
+
 @torch.no_grad()
 @every_view
 def test_an_adapter_and_a_swin_see_every_view(name):
@@ -156,6 +170,37 @@ def test_networks_of_every_dtype_get_frames_of_uint8_in_their_dtype(name, dtype)
         sampled, result = model.sample(frames, prepared), model(frames, lens)
         assert sampled.dtype == result.dtype == dtype
         assert torch.equal(model.run_sampled(sampled, prepared), result)
+
+
+class AnyRatio(PixelView):
+    """The picture of an equidistant lens, on an image of any size."""
+
+    def of(self, lens):
+        return Equidistant(min(self.size) / 2 / lens.theta_max, lens.theta_max)
+
+    def image_points(self, lens, size):
+        return pixels.reprojection(lens, size, self.of(lens), self.size)
+
+    def view_points(self, lens, size):
+        return pixels.reprojection(self.of(lens), self.size, lens, size)
+
+    def pixel_rays(self, lens, size):
+        return pixels.pixel_rays(self.of(lens), self.size)
+
+
+@torch.no_grad()
+def test_a_view_of_ones_own_needs_three_methods(monkeypatch):
+    monkeypatch.setitem(_VIEWS, "own", AnyRatio)
+    test_what_is_seen_comes_back_also_from_coarser_maps("own", LENSES["general"])
+    test_the_rays_of_the_views_pixels_land_where_the_view_reads("own", LENSES["two"])
+    test_frames_of_uint8_are_normalized("own")
+    test_an_adapter_and_a_swin_see_every_view("own")
+    test_a_unet_sees_every_view_and_brings_its_result_back("own")
+    test_networks_of_every_dtype_get_frames_of_uint8_in_their_dtype("own", torch.bfloat16)
+    assert repr(make_view("own", (24, 32))) == "AnyRatio(size=(24, 32))"
+    monkeypatch.setitem(_VIEWS, "own", lambda _size: View())
+    with pytest.raises(TypeError, match=r"'own' has no such option: .*'mean'"):
+        make_view("own", (24, 32))
 
 
 def test_a_view_of_ones_own_has_a_name():
