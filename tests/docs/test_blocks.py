@@ -239,8 +239,10 @@ PROGRAMS: dict[str, Callable] = {
 def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
     scope: dict = {}
     for block in blocks(ROOT / "docs/howto/use.md"):
-        if block.language == "python" and "PolarView(" not in block.text:
+        if block.language == "python":
             run_python(block.text, scope)
+        if "polar" in scope:
+            break
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
 
 
