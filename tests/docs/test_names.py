@@ -1,4 +1,4 @@
-"""Names in code font on the page of lenses exist."""
+"""Names in code font on the page of lenses exist, and files on the page for contributors."""
 
 import re
 from pathlib import Path
@@ -21,3 +21,12 @@ def test_every_name_on_the_page_of_lenses_exists():
     names = {match[1] for match in found if match} - {"darswin"}
     assert len(names) > 40 and not names - known - THEIRS
     assert names >= THEIRS  # remove what the page no longer has
+
+
+def test_every_file_on_the_page_for_contributors_exists():
+    root = PAGE.parents[1]
+    text = (root / "docs" / "contributing.md").read_text()
+    folders = "|".join(entry.name for entry in root.iterdir() if entry.is_dir())
+    found = set(re.findall(rf"`((?:{folders})/[\w./]+)`", text))
+    files = {name for name in found if "NAME" not in name}
+    assert len(files) > 20 and not [name for name in files if not (root / name).exists()]
