@@ -145,7 +145,7 @@ class Unet(PixelModel):
 
     Raises:
         ValueError: an option of the encoder or of the Unet is wrong.
-        TypeError: in forward, the lens is missing and the view uses it.
+        TypeError: the encoder is none; in forward, the lens is missing and the view uses it.
 
     Source: DarSwin-Unet, WACV 2025. Here the way back to the pixels is a differentiable
         interpolation instead of the nearest neighbour, and the skips start at the end of each
@@ -167,6 +167,11 @@ class Unet(PixelModel):
         places: bool = True,
     ):
         super().__init__(task, typical_distance)
+        if not isinstance(encoder, Encoder):
+            raise TypeError(
+                f"encoder must be an Encoder, got {type(encoder).__name__}: create_model makes a "
+                "Unet from options"
+            )
         encoder.reset_classifier(0)
         self.encoder, self.view, self.image_size = encoder, encoder.view, encoder.image_size
         self.in_chans, self.feature_info = encoder.in_chans, encoder.feature_info

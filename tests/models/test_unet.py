@@ -11,7 +11,7 @@ from darswin import create_model, polar_grid
 from darswin.layers.transformer import PatchMerging
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.models.pixel import DistanceHead, PixelHead
-from darswin.models.unet import PatchExpand, SkipJoin
+from darswin.models.unet import PatchExpand, SkipJoin, Unet
 from darswin.ops import polar_to_image
 from darswin.views import PolarView
 
@@ -259,3 +259,8 @@ def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options)
     model.encoder.load_state_dict(trained.state_dict())
     got = model.encoder.forward_intermediates(x, lens, intermediates_only=True)
     assert all(torch.equal(a, b) for a, b in zip(got, maps, strict=True))
+
+
+def test_a_unet_takes_an_encoder():
+    with pytest.raises(TypeError, match="encoder must be an Encoder, got int: create_model makes"):
+        Unet(10)
