@@ -77,6 +77,20 @@ class OfficialPolynomial(Lens, register=False):
         return self._angle(radius / full)
 
 
+class OfficialAttention(PolarWindowAttention):
+    """The attention of the released code, whose angles are equal steps up to tan θ_max."""
+
+    def angles(self, grid: PolarGrid) -> Tensor:
+        return grid.last[:, None] * _inclusive(self.map_size[0], grid.last)
+
+
+class OfficialView(PolarView):
+    """The grid of the released code: in each step as there, with its rounding."""
+
+    def grid(self, lens: Lens, image_size: Pair) -> PolarGrid:
+        return _grid(lens, image_size, self)
+
+
 class OfficialDarSwin(DarSwin):
     """The authors' released DarSwin-A. `OfficialDarSwin(num_classes)` has the sizes of the paper.
 
@@ -89,6 +103,7 @@ class OfficialDarSwin(DarSwin):
     """
 
     square_images = True
+    view_class = OfficialView
 
     def __init__(
         self,
@@ -116,11 +131,6 @@ class OfficialDarSwin(DarSwin):
             spacing="tan", placement="edges", jitter=0.0, window=window,
             position_bias=position_bias, harmonics=harmonics, mean=mean, std=std,
         )  # fmt: skip
-        view = self.view
-        self.view = OfficialView(
-            view.rings, view.sectors, view.samples, spacing="tan", placement="edges",
-            mean=view.mean, std=view.std,
-        )  # fmt: skip
 
     def _finish(self, sizes: Sequence[StageSizes], patch: Pair) -> None:
         super()._finish([_with_shift(of_stage, self._window) for of_stage in sizes], patch)
@@ -136,20 +146,6 @@ class OfficialDarSwin(DarSwin):
             # The released code has M_φ rows of coefficients if the window is the whole map.
             periodic_bias=sizes.window == sizes.map_size,
         )
-
-
-class OfficialAttention(PolarWindowAttention):
-    """The attention of the released code, whose angles are equal steps up to tan θ_max."""
-
-    def angles(self, grid: PolarGrid) -> Tensor:
-        return grid.last[:, None] * _inclusive(self.map_size[0], grid.last)
-
-
-class OfficialView(PolarView):
-    """The grid of the released code: in each step as there, with its rounding."""
-
-    def grid(self, lens: Lens, image_size: Pair) -> PolarGrid:
-        return _grid(lens, image_size, self)
 
 
 def _with_shift(sizes: StageSizes, window: Pair) -> StageSizes:

@@ -62,6 +62,7 @@ class DarSwin(Encoder):
     """
 
     view: PolarView
+    view_class: type[PolarView] = PolarView
 
     def __init__(
         self,
@@ -97,7 +98,7 @@ class DarSwin(Encoder):
             raise ValueError(f"variant must be 'A' or 'RA', got {variant!r}")
         self.position_bias, self.harmonics = position_bias, harmonics
         self.periodic_bias = periodic_bias
-        self.view = PolarView(
+        self.view = self.view_class(
             rings, sectors, samples, spacing=spacing, sample_spacing=sample_spacing,
             placement=placement, theta_max=theta_max, jitter=jitter,
             mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
