@@ -82,8 +82,8 @@ def test_boxes_of_every_view_come_back_to_the_things_in_the_picture(name, lens):
     assert set(found["labels"].tolist()) >= set(range(4)[shows])
     overlap = of_boxes.iou(found["boxes"], exact)
     best = {k: overlap[found["labels"] == k, k].max().item() for k in range(4)[shows]}
-    # The square shears things along its diagonals.
-    least, mean = (0.6, 0.75) if name == "square" else (0.75, 0.85)
+    # The square shears things along its diagonals; the middle of a perspective view is coarse.
+    least, mean = (0.6, 0.75) if name in ("square", "perspective") else (0.75, 0.85)
     assert min(best.values()) > least and np.mean([*best.values()]) > mean, best
     if name == "none":
         assert torch.equal(found["boxes"], exact) and "rays" not in found
