@@ -117,7 +117,7 @@ def predict(
                 if file.is_video:
                     answer_video(file.name, every, lenses, answers)
                 else:
-                    image, orientation = read_oriented(file.name, net.in_chans)
+                    image, orientation = read_oriented(file.name, answers.channels)
                     taken_with = _lens(lenses, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
@@ -173,7 +173,7 @@ def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> Non
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
-        for frame in read_frames(name, answers.model.in_chans, every):
+        for frame in read_frames(name, answers.channels, every):
             taken_with = _lens(lenses, name, frame.image, frame.orientation)
             entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
