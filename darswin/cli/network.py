@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,19 +19,18 @@ from darswin.data.splits import read_list
 from darswin.deploy.network import Detections, OnnxNetwork
 from darswin.frames import Plan, Sampler, plan
 from darswin.lens import Lens
+from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, naming
-from darswin.views import Prepared, make_view
-from darswin.views.base import PixelView
-from darswin.views.plain import PlainView
-from darswin.viz.pixels import draw_boxes, label_image, overlay, palette
+from darswin.views import PixelView, PlainView, Prepared, make_view
+from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
-VIEW = "mercator"
+VIEW, THRESHOLD = "mercator", 0.3
 
 
 class Seen(NamedTuple):
-    """A view of the pictures of one camera."""
+    """The view of the pictures of one camera."""
 
     sampler: Sampler
     lens: Lens  # float64
@@ -40,36 +40,182 @@ class Seen(NamedTuple):
 class NetworkAnswers(Answers):
     """Carries what a network finds in a view to the pictures.
 
-    Boxes and maps become files in a folder; numbers do not.
+    Detections and maps become files in the folder `out`; numbers do not. `names` are those of
+    `file_names`.
 
-    Args:
-        network: the file of the network.
-        view: the name of a view of pixels, with ":" and a count for tiles.
-        size, fov_deg, up, mean, std, channels, threshold, labels: as for `darswin predict`.
+    Args: those of `darswin predict` with these names.
 
     Raises:
         ValueError: an option is wrong, or does not fit the view or the network.
     """
 
-    out: Path | None = None  # the folder of the files, and their names
-    names: Mapping[str, str] = {}
+    out: Path
+    names: Mapping[str, str]
 
     def __init__(
-        self, network: str, view: str | None = None, size: tuple[int, int] | None = None,
+        self, network: str, *, view: str | None = None, size: tuple[int, int] | None = None,
         fov_deg: float | None = None, up: Sequence[float] | None = None,
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
     ):  # fmt: skip
-        name, _, number = (view or VIEW).partition(":")
-        options = _options(name, number, fov_deg, up)
-        threshold = 0.3 if threshold is None else threshold
-        check("threshold", threshold, math.isfinite(threshold), "a finite number")
-        self.labels = None if labels is None else read_list(labels)
-        # The size is known only from the network, and the number of pictures only from the view.
-        count = _view(name, (64, 64), options).count
-        self.network = OnnxNetwork(network, size, count, threshold)
+        lowest = THRESHOLD if threshold is None else threshold
+        check("threshold", lowest, math.isfinite(lowest), "a finite number")
+        make = partial(_view, view or VIEW, fov_deg, up, mean or 0.0, std or 1.0)
+        # The network says how large its pictures are, but the view how many there are.
+        self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
         super().__init__(self.network.channels)
-        self.view = _view(name, self.network.size, options)
-        self.is_bgr = channels == "bgr"
-        given = mean is not None or std is not None or channels is not None
-        self._normalization = dict(mean=mean or (0.0,), std=std or (1.0,))
+        if self.network.output == "uint8" and (mean or std) is not None:
+            text = f"{network} takes pixels of uint8: leave `mean` and `std` out"
+            raise naming(ValueError(text), "mean", "std")
+        self.view = make(self.network.size)
+        self._normalization = {
+            name: per_channel(name, getattr(self.view, name), self.channels)
+            for name in ("mean", "std")
+        }
+        self.labels = None if labels is None else read_list(labels)
+        self._step = -1 if channels == "bgr" else 1
+
+    def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
+        try:
+            seen: Seen = self._once(lens, lambda: self._seen(image.shape[:2], lens))
+        except ValueError as error:
+            raise BrokenImageError(f"{said(entry)} has no such view: {error}") from error
+        pictures = seen.sampler(image[..., :: self._step])
+        start = time.perf_counter()
+        try:
+            found = self.network(pictures)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"no prediction for {said(entry)}: {error}") from error
+        self.seconds += time.perf_counter() - start
+        if isinstance(found, list):
+            answer = self._detections(entry, image, seen, found)
+        else:
+            answer = self._outputs(entry, image, seen, found)
+        self.found.append(entry | answer)
+
+    def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
+        lens, prepared = lens.detach().to(torch.float64), None
+        if not isinstance(self.view, PlainView):
+            made = plan(self.view, lens, size, output=self.network.output, **self._normalization)
+        elif size == self.network.size:
+            rows, columns = np.indices(size, np.int16)
+            zeros = np.zeros(size, np.float32)
+            form = (size, self.network.output, *self._normalization.values())
+            made = Plan(columns, rows, zeros, zeros, *form)
+        else:
+            (height, width), (own_height, own_width) = size, self.network.size
+            raise ValueError(
+                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}: "
+                "choose a view that resamples it"
+            )
+        if self.network.kind == "maps":
+            with torch.inference_mode():
+                prepared = self.view.prepare(lens, size, rays=False)
+        return Seen(Sampler(made), lens, prepared)
+
+    def _detections(
+        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
+    ) -> dict[str, Any]:
+        """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
+        size, parts = image.shape[:2], []
+        for tile, (inner, *others) in enumerate(found):
+            inner = boxes.clip(inner, self.network.size)
+            carried, visible = boxes.carry(inner, partial(seen.sampler.plan.points, tile=tile))
+            kept = (inner[:, :2] < inner[:, 2:]).all(1) & (visible > 0)
+            parts.append([values[kept] for values in (carried, visible, *others)])
+        carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
+        carried = boxes.clip(carried, size)
+        if len(found) == 1:  # a network knows best which of its own boxes are one thing
+            order = np.argsort(-scores, kind="stable")
+        else:
+            order = boxes.merge(carried, scores, labels)
+        carried, visible, scores, labels = (v[order] for v in (carried, visible, scores, labels))
+
+        def to_rays(points: np.ndarray) -> np.ndarray:
+            return seen.lens.unproject_points(torch.from_numpy(points)[None], size)[0].numpy()
+
+        there = boxes.spherical(carried, to_rays)
+        names = [self._name(label) for label in labels.tolist()]
+        colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
+        texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+        picture = draw_boxes(image, carried, texts, colors)
+        entries = [
+            {
+                "label": names[k],
+                "score": round(scores[k].item(), 4),
+                "box": _rounded(carried[k], 2),
+                "visible": round(visible[k].item(), 4),
+                **{
+                    f"{angle}_deg": _rounded(np.degrees(getattr(there, angle)[k]), 3)
+                    for angle in ("azimuth", "elevation", "width", "height")
+                },
+                "ray": _rounded(there.ray[k], 6),
+            }
+            for k in range(len(names))
+        ]
+        name = file_of(entry, self.names)
+        return {"overlay": write_overlay(self.out, name, picture), "detections": entries}
+
+    def _name(self, label: int) -> str | int:
+        """The name of a class, or its number if there are no names."""
+        if self.labels is None:
+            return label
+        if not 0 <= label < len(self.labels):
+            text = f"{self.network.path} found class {label}, but `labels` has {len(self.labels)}"
+            raise naming(ValueError(f"{text} names, from 0"), "labels")
+        return self.labels[label]
+
+    def _outputs(
+        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        """Writes maps at the size of the picture; numbers are part of the answer."""
+        answer: dict[str, Any] = {}
+        for output, values in found.items():
+            if values.ndim < 4:
+                answer[output] = (values[0] if len(values) == 1 else values).tolist()
+                continue
+            folder = re.sub(r"[^\w.-]", "_", output)
+            name = f"{folder}/{file_of(entry, self.names)}"
+            seen_pixels = np.ones_like(values[:, :1])
+            maps = torch.from_numpy(np.concatenate((values, seen_pixels), 1)).float()
+            with torch.inference_mode():
+                *planes, reached = self.view.back(maps, seen.prepared)[0].numpy()
+            content = io.BytesIO()
+            np.save(content, np.stack(planes))
+            replace_file(self.out / f"maps/{name}.npy", content.getbuffer())
+            answer[output] = {"map": f"maps/{name}.npy"}
+            if 2 <= len(planes) <= IGNORE:
+                labels = np.where(reached > 0.5, np.argmax(planes, 0), IGNORE).astype(np.uint8)
+                colors = palette(len(planes))
+                replace_file(self.out / f"labels/{name}.png", label_png(labels, colors))
+                laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
+                answer[output]["labels"] = f"labels/{name}.png"
+                answer[output]["overlay"] = write_overlay(self.out, name, laid)
+        return answer
+
+
+def _view(
+    spec: str, fov_deg: float | None, up: Sequence[float] | None, mean: Any, std: Any,
+    size: tuple[int, int],
+) -> PixelView:  # fmt: skip
+    """The view NAME[:COUNT] of (H, W)."""
+    name, _, count = spec.partition(":")
+    options: dict[str, Any] = {"up": up}
+    if count:
+        check("view", spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
+        options["count"] = int(count)
+    if fov_deg is not None:
+        check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
+        options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
+    try:
+        view = make_view(name, size, mean=mean, std=std, **options)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    check("view", spec, isinstance(view, PixelView), "a view of pixels")
+    return view
+
+
+def _rounded(values: np.ndarray, digits: int) -> Any:
+    """Numbers for JSON, which has no NaN."""
+    whole = np.where(np.isnan(values), None, np.round(values, digits))
+    return whole.tolist()
