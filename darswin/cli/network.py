@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -23,10 +23,11 @@ from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, naming
-from darswin.views import PixelView, PlainView, Prepared, make_view
+from darswin.views import PixelView, PlainView, make_view
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
+ANGLES = ("azimuth_deg", "elevation_deg", "width_deg", "height_deg")
 
 
 class Seen(NamedTuple):
@@ -34,23 +35,17 @@ class Seen(NamedTuple):
 
     sampler: Sampler
     lens: Lens  # float64
-    prepared: Prepared | None  # for maps
+    back: Any  # what the view prepares for maps; None for others
 
 
 class NetworkAnswers(Answers):
     """Carries what a network finds in a view to the pictures.
-
-    Detections and maps become files in the folder `out`; numbers do not. `names` are those of
-    `file_names`.
 
     Args: those of `darswin predict` with these names.
 
     Raises:
         ValueError: an option is wrong, or does not fit the view or the network.
     """
-
-    out: Path
-    names: Mapping[str, str]
 
     def __init__(
         self, network: str, *, view: str | None = None, size: tuple[int, int] | None = None,
@@ -75,6 +70,11 @@ class NetworkAnswers(Answers):
         self.labels = None if labels is None else read_list(labels)
         self._step = -1 if channels == "bgr" else 1
 
+    def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
+        """Says where files go, which numbers do not need; names: those of `file_names`."""
+        self._out, self._names = out or Path(), names
+        return self
+
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         try:
             seen: Seen = self._once(lens, lambda: self._seen(image.shape[:2], lens))
@@ -94,14 +94,15 @@ class NetworkAnswers(Answers):
         self.found.append(entry | answer)
 
     def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
-        lens, prepared = lens.detach().to(torch.float64), None
+        lens, back = lens.detach().to(torch.float64), None
         if not isinstance(self.view, PlainView):
             made = plan(self.view, lens, size, output=self.network.output, **self._normalization)
         elif size == self.network.size:
             rows, columns = np.indices(size, np.int16)
             zeros = np.zeros(size, np.float32)
-            form = (size, self.network.output, *self._normalization.values())
-            made = Plan(columns, rows, zeros, zeros, *form)
+            made = Plan(
+                columns, rows, zeros, zeros, size, self.network.output, **self._normalization
+            )
         else:
             (height, width), (own_height, own_width) = size, self.network.size
             raise ValueError(
@@ -110,8 +111,8 @@ class NetworkAnswers(Answers):
             )
         if self.network.kind == "maps":
             with torch.inference_mode():
-                prepared = self.view.prepare(lens, size, rays=False)
-        return Seen(Sampler(made), lens, prepared)
+                back = self.view.prepare(lens, size, rays=False)
+        return Seen(Sampler(made), lens, back)
 
     def _detections(
         self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
@@ -139,22 +140,22 @@ class NetworkAnswers(Answers):
         colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
         texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
         picture = draw_boxes(image, carried, texts, colors)
+        angles = np.degrees(
+            np.stack([there.azimuth, there.elevation, there.width, there.height], 1)
+        )
+        columns = {
+            "label": names,
+            "score": _rounded(scores, 4),
+            "box": _rounded(carried, 2),
+            "visible": _rounded(visible, 4),
+            **dict(zip(ANGLES, _rounded(angles.T, 3), strict=True)),
+            "ray": _rounded(there.ray, 6),
+        }
         entries = [
-            {
-                "label": names[k],
-                "score": round(scores[k].item(), 4),
-                "box": _rounded(carried[k], 2),
-                "visible": round(visible[k].item(), 4),
-                **{
-                    f"{angle}_deg": _rounded(np.degrees(getattr(there, angle)[k]), 3)
-                    for angle in ("azimuth", "elevation", "width", "height")
-                },
-                "ray": _rounded(there.ray[k], 6),
-            }
-            for k in range(len(names))
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ]
-        name = file_of(entry, self.names)
-        return {"overlay": write_overlay(self.out, name, picture), "detections": entries}
+        name = file_of(entry, self._names)
+        return {"overlay": write_overlay(self._out, name, picture), "detections": entries}
 
     def _name(self, label: int) -> str | int:
         """The name of a class, or its number if there are no names."""
@@ -175,22 +176,22 @@ class NetworkAnswers(Answers):
                 answer[output] = (values[0] if len(values) == 1 else values).tolist()
                 continue
             folder = re.sub(r"[^\w.-]", "_", output)
-            name = f"{folder}/{file_of(entry, self.names)}"
+            name = f"{folder}/{file_of(entry, self._names)}"
             seen_pixels = np.ones_like(values[:, :1])
             maps = torch.from_numpy(np.concatenate((values, seen_pixels), 1)).float()
             with torch.inference_mode():
-                *planes, reached = self.view.back(maps, seen.prepared)[0].numpy()
+                *planes, reached = self.view.back(maps, seen.back)[0].numpy()
             content = io.BytesIO()
             np.save(content, np.stack(planes))
-            replace_file(self.out / f"maps/{name}.npy", content.getbuffer())
+            replace_file(self._out / f"maps/{name}.npy", content.getbuffer())
             answer[output] = {"map": f"maps/{name}.npy"}
             if 2 <= len(planes) <= IGNORE:
                 labels = np.where(reached > 0.5, np.argmax(planes, 0), IGNORE).astype(np.uint8)
                 colors = palette(len(planes))
-                replace_file(self.out / f"labels/{name}.png", label_png(labels, colors))
+                replace_file(self._out / f"labels/{name}.png", label_png(labels, colors))
                 laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
                 answer[output]["labels"] = f"labels/{name}.png"
-                answer[output]["overlay"] = write_overlay(self.out, name, laid)
+                answer[output]["overlay"] = write_overlay(self._out, name, laid)
         return answer
 
 
@@ -211,11 +212,13 @@ def _view(
         view = make_view(name, size, mean=mean, std=std, **options)
     except TypeError as error:
         raise ValueError(str(error)) from error
-    check("view", spec, isinstance(view, PixelView), "a view of pixels")
+    if not isinstance(view, PixelView):
+        raise ValueError(f"--view {name} shows no picture to a network")
     return view
 
 
-def _rounded(values: np.ndarray, digits: int) -> Any:
-    """Numbers for JSON, which has no NaN."""
-    whole = np.where(np.isnan(values), None, np.round(values, digits))
-    return whole.tolist()
+def _rounded(values: Any, digits: int) -> Any:
+    """Numbers in lists for JSON, which has no NaN."""
+    if np.ndim(values):
+        return [_rounded(value, digits) for value in values]
+    return None if math.isnan(values) else round(values, digits)

@@ -4,15 +4,16 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
+from darswin.cli.network import NetworkAnswers
 from darswin.cli.options import check_folder
 from darswin.compat import load_official
 from darswin.data.folders import PICTURES, pictures_and_videos_below
@@ -98,7 +99,7 @@ def predict(
         labels: a file with the names of the network's classes, from class 0: a text file with a
             name in each line, or a JSON list.
     """
-    options = {
+    options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
         "channels": channels, "threshold": threshold, "labels": labels,
     }  # fmt: skip
@@ -127,12 +128,11 @@ def predict(
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
     check_paths(paths)
-    if network is not None:
-        answers: Answers = NetworkAnswers(network, **options)
-        kind = answers.network.kind
+    if network is None:
+        kind, make = _of_model(weights, top)
     else:
-        net, card = trained_model(weights)
-        kind = card.task
+        through = NetworkAnswers(network, **options)
+        kind, make = through.network.kind, through.into
     if task not in (None, kind):
         raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
     prints = kind in ("classification", "numbers")
@@ -144,9 +144,9 @@ def predict(
     else:
         assert run is not None
         lenses = lenses_of_run(run, camera, coefficients, names)
-    if not prints:
-        folder, of_files = claim_folder(out), file_names(paths, files)
-        out = str(folder / ANSWERS)
+    folder = None if prints else claim_folder(out)
+    out = out if folder is None else str(folder / ANSWERS)
+    answers = make(folder, file_names(paths, files))
     bad: list[str] = []
     try:
         for file in files:
@@ -173,6 +173,20 @@ def predict(
         count = f"no {what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
+
+
+def _of_model(
+    weights: str | Path, top: int
+) -> tuple[str, Callable[[Path | None, Mapping[str, str]], Answers]]:
+    """The task of a model, and what makes its answers, for a folder and the names of files."""
+    net, card = trained_model(weights)
+
+    def make(folder: Path | None, names: Mapping[str, str]) -> Answers:
+        if folder is None:
+            return ClassAnswers(net, card, top)
+        return ANSWERS_OF[card.task](net, card, folder, names)
+
+    return card.task, make
 
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
