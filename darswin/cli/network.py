@@ -63,10 +63,9 @@ class NetworkAnswers(Answers):
             text = f"{network} takes pixels of uint8: leave `mean` and `std` out"
             raise naming(ValueError(text), "mean", "std")
         self.view = make(self.network.size)
-        self._normalization = {
-            name: per_channel(name, getattr(self.view, name), self.channels)
-            for name in ("mean", "std")
-        }
+        self._mean, self._std = (
+            per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
+        )
         self.labels = None if labels is None else read_list(labels)
         self._step = -1 if channels == "bgr" else 1
 
@@ -96,12 +95,14 @@ class NetworkAnswers(Answers):
     def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
         lens, back = lens.detach().to(torch.float64), None
         if not isinstance(self.view, PlainView):
-            made = plan(self.view, lens, size, output=self.network.output, **self._normalization)
+            made = plan(
+                self.view, lens, size, output=self.network.output, mean=self._mean, std=self._std
+            )
         elif size == self.network.size:
             rows, columns = np.indices(size, np.int16)
             zeros = np.zeros(size, np.float32)
             made = Plan(
-                columns, rows, zeros, zeros, size, self.network.output, **self._normalization
+                columns, rows, zeros, zeros, size, self.network.output, self._mean, self._std
             )
         else:
             (height, width), (own_height, own_width) = size, self.network.size
