@@ -6,7 +6,8 @@ import onnx
 import onnx.parser
 
 # Of pictures x, (B, 3, H, W), in [0, 1]: the box of all pixels above 0.5; as its score the share of
-# their number in that number and 20; as its class the channel with most light.
+# their number in that number and 20, and half of it if one is at a border; as its class the channel
+# with most light.
 _FINDS = """
     one = Constant<value_int=1>() half = Constant<value_float=0.5>()
     some = Constant<value_float=20.0>() a0 = Constant<value_ints=[0]>()
@@ -17,8 +18,12 @@ _FINDS = """
     x0 = ArgMax<axis=1>(across) xl = ArgMax<axis=1, select_last_index=1>(across) x1 = Add(xl, one)
     y0 = ArgMax<axis=1>(down) yl = ArgMax<axis=1, select_last_index=1>(down) y1 = Add(yl, one)
     corners = Concat<axis=1>(x0, y0, x1, y1) box = Cast<to=1>(corners) box1 = Unsqueeze(box, a1)
-    area = ReduceSum<keepdims=0>(lit, a12) more = Add(area, some) share = Div(area, more)
-    score1 = Unsqueeze(share, a1)
+    first = Constant<value_int=0>() end = Constant<value_int=-1>()
+    left = Gather<axis=1>(across, first) right = Gather<axis=1>(across, end)
+    top = Gather<axis=1>(down, first) bottom = Gather<axis=1>(down, end)
+    unit = Constant<value_float=1.0>() cut = Max(left, right, top, bottom) by = Add(cut, unit)
+    area = ReduceSum<keepdims=0>(lit, a12) more = Add(area, some) part_ = Div(area, more)
+    share = Div(part_, by) score1 = Unsqueeze(share, a1)
     light = ReduceMean<keepdims=0>(x, a23) label1 = ArgMax<axis=1>(light)
     score2 = Unsqueeze(score1, a2) label2 = Unsqueeze(label1, a2) class2 = Cast<to=1>(label2)
     table = Concat<axis=2>(box1, score2, class2)

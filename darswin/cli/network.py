@@ -55,11 +55,14 @@ class NetworkAnswers(Answers):
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
         check("threshold", lowest, math.isfinite(lowest), "a finite number")
-        make = partial(_view, view or VIEW, fov_deg, up, mean or 0.0, std or 1.0)
+        make = partial(_view, view or VIEW, fov_deg, up, mean or (0.0,), std or (1.0,))
         # The network says how large its pictures are, but the view how many there are.
-        self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
+        try:
+            self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
+        except ModuleNotFoundError as error:  # of onnxruntime, and says how to install it
+            raise ValueError(str(error)) from error
         super().__init__(self.network.channels)
-        if self.network.output == "uint8" and (mean or std) is not None:
+        if self.network.output == "uint8" and (mean or std):
             text = f"{network} takes pixels of uint8: leave `mean` and `std` out"
             raise naming(ValueError(text), "mean", "std")
         self.view = make(self.network.size)
@@ -110,6 +113,8 @@ class NetworkAnswers(Answers):
                 f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}: "
                 "choose a view that resamples it"
             )
+        if (made.columns < -1).all():
+            raise ValueError("it shows nothing of the picture: choose another, or check the lens")
         if self.network.kind == "maps":
             with torch.inference_mode():
                 back = self.view.prepare(lens, size, rays=False)
@@ -197,12 +202,17 @@ class NetworkAnswers(Answers):
 
 
 def _view(
-    spec: str, fov_deg: float | None, up: Sequence[float] | None, mean: Any, std: Any,
-    size: tuple[int, int],
+    spec: str, fov_deg: float | None, up: Sequence[float] | None, mean: Sequence[float],
+    std: Sequence[float], size: tuple[int, int],
 ) -> PixelView:  # fmt: skip
     """The view NAME[:COUNT] of (H, W)."""
     name, _, count = spec.partition(":")
-    options: dict[str, Any] = {"up": up}
+    options: dict[str, Any] = {
+        key: values[0] if len(values) == 1 else values
+        for key, values in (("mean", mean), ("std", std))
+    }
+    if up is not None:
+        options["up"] = up
     if count:
         check("view", spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
         options["count"] = int(count)
@@ -210,7 +220,7 @@ def _view(
         check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
         options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
     try:
-        view = make_view(name, size, mean=mean, std=std, **options)
+        view = make_view(name, size, **options)
     except TypeError as error:
         raise ValueError(str(error)) from error
     if not isinstance(view, PixelView):
