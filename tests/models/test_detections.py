@@ -82,8 +82,8 @@ def test_boxes_of_every_view_come_back_to_the_things_in_the_picture(name, lens):
     assert set(found["labels"].tolist()) >= set(range(4)[shows])
     overlap = of_boxes.iou(found["boxes"], exact)
     best = {k: overlap[found["labels"] == k, k].max().item() for k in range(4)[shows]}
-    # The square shears things along its diagonals.
-    least, mean = (0.6, 0.75) if name == "square" else (0.75, 0.85)
+    # The square shears things along its diagonals; the middle of a perspective view is coarse.
+    least, mean = (0.6, 0.75) if name in ("square", "perspective") else (0.75, 0.85)
     assert min(best.values()) > least and np.mean([*best.values()]) > mean, best
     if name == "none":
         assert torch.equal(found["boxes"], exact) and "rays" not in found
@@ -101,7 +101,7 @@ def test_boxes_of_every_view_come_back_to_the_things_in_the_picture(name, lens):
 def test_every_form_of_detections_gives_the_same():
     lens, (images, _) = LENSES["radial"], disks(LENSES["radial"])
     images = torch.cat((images, images.flip(3)))
-    view = make_view("tiles", (256, 256), count=4)
+    view = make_view("tiles", (256, 256))
     as_list = LensAdapter(Disks("list"), view=view)(images, lens)
     by_function = LensAdapter(Disks("dict"), view=view, boxes=lambda out: out["found"])
     assert [len(found["boxes"]) for found in as_list] == [4, 4]
