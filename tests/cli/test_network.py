@@ -63,7 +63,7 @@ LENSES = {
 # a half pixels of the view, and more where a view does not show discs as upright ellipses.
 VIEWS = {
     "none": (None, 1.1),
-    "tiles:4": ((256, 256), 2.0),
+    "tiles:9": ((256, 256), 2.0),
     "tiles:5": ((256, 256), 1.8),
     "mercator": ((256, 384), 1.5),
     "stereographic": ((320, 320), 1.5),
@@ -131,8 +131,8 @@ def test_a_disc_is_found_at_its_place(tmp_path, view, name):
         known.append((place, box, NAMES[k % 3]))
     (tmp_path / "names.txt").write_text("\n".join(NAMES))
     network = write_graph(tmp_path / "n.onnx", size=size or SIZE)
-    argv = [tmp_path / "in", "--network", network, "--view", view, "--threshold", "0.1"]
-    argv += ["--labels", tmp_path / "names.txt"]
+    argv = [tmp_path / "in", "--network", network, "--view", view, "--threshold", "0.5"]
+    argv += ["--labels", tmp_path / "names.txt"]  # parts of discs have lower scores
     argv += ["--fov_deg", "130"] if view == "perspective" else []
     found = predict(*argv, out=tmp_path / "out", lens=lens_of(name))
     for k, (entry, (place, box, label)) in enumerate(zip(found, known, strict=True)):
@@ -450,6 +450,7 @@ def test_maps_come_back_to_the_pixels(tmp_path, view):
     size = SIZE if view == "none" else (320, 320)
     network = write_graph(tmp_path / "n.onnx", "map and numbers", size=size)
     argv = [tmp_path / "p.png", "--network", network, "--view", view]
+    argv += ["--fov_deg", "120"] if view == "perspective" else []
     (entry,) = predict(*argv, out=tmp_path / "out", lens=lens_of("Equidistant"))
     files = entry["same"]
     assert files == {"map": "maps/same/p.npy", "labels": "labels/same/p.png",
@@ -463,12 +464,12 @@ def test_maps_come_back_to_the_pixels(tmp_path, view):
     if view == "none":
         assert shown.all()
     else:
-        assert shown.mean() > 0.5 and not shown[beyond].any() and not same[:, beyond].any()
-    inner = cv2.erode(shown.astype(np.uint8), np.ones((9, 9))) > 0
+        assert shown.mean() > 0.3 and not shown[beyond].any() and not same[:, beyond].any()
+    inner = cv2.erode(shown.astype(np.uint8), np.ones((15, 15))) > 0
     difference = np.abs(same.transpose(1, 2, 0) - picture / 255)[inner]
-    assert difference.max() < 0.03
+    assert np.quantile(difference, 0.99) < 0.01  # the borders of the picture mix with black
     clear = inner & (np.abs(picture[..., 0].astype(int) - picture[..., 1]) > 15)
-    assert (labels == picture.argmax(-1))[clear].all()
+    assert (labels == picture.argmax(-1))[clear].mean() > 0.99
     numbers = np.array(entry["light_"])  # of the view, or of each tile
     assert numbers.shape == ((5, 3) if view == "tiles:5" else (3,))
 
