@@ -79,6 +79,22 @@ OUTPUTS = {
         "zero = Sub(score2, score2) nan = Div(zero, zero) "
         "nans = Concat<axis=2>(nan, nan, nan, nan) found = Concat<axis=2>(nans, score2, class2)",
     ),
+    "infinite boxes": (
+        "float[B,N,6] found",
+        "zero = Sub(score2, score2) inf = Div(score2, zero) "
+        "far = Concat<axis=2>(inf, inf, inf, inf) found = Concat<axis=2>(far, score2, class2)",
+    ),
+    "infinite scores": (
+        "float[B,N,6] found",
+        "zero = Sub(score2, score2) inf = Div(score2, zero) "
+        "found = Concat<axis=2>(box1, inf, class2)",
+    ),
+    "infinite": ("float[B,K] logits", "zero = Sub(light, light) inf = Div(score1, zero) "
+                 "logits = Add(light, inf)"),
+    "texts": (
+        "string[B,N] labels, float[B,N,4] boxes, float[B,N] scores",
+        "labels = Cast<to=8>(label1) boxes = Identity(box1) scores = Identity(score1)",
+    ),
     "nan": ("float[B,K] logits", "zero = Sub(light, light) logits = Div(zero, zero)"),
 }  # fmt: skip
 DETECTORS = ("named", "of one picture", "columns and more", "table", "table of one picture")

@@ -40,7 +40,6 @@ from darswin.viz.pixels import (
 Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # takes a half to a third of the time of single images
-LENSES = 16  # whose prepared values are kept, for folders whose pictures come from several cameras
 ANSWERS = "predictions.json"
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
@@ -56,6 +55,8 @@ class Answers:
 
     Args: channels: of the images, 1 or 3.
     """
+
+    most_lenses = 16  # whose values are kept, for folders whose pictures come from several cameras
 
     def __init__(self, channels: int):
         self.channels = channels
@@ -74,7 +75,7 @@ class Answers:
         """What `make` makes of a lens, made once for each of the last lenses."""
         if id(lens) not in self._kept:
             made = make()
-            if len(self._kept) == LENSES:
+            if len(self._kept) == self.most_lenses:
                 del self._kept[next(iter(self._kept))]
             self._kept[id(lens)] = lens, made
         return self._kept[id(lens)][1]

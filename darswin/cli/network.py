@@ -27,7 +27,6 @@ from darswin.views import PixelView, PlainView, make_view
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
-ANGLES = ("azimuth_deg", "elevation_deg", "width_deg", "height_deg")
 
 
 class Seen(NamedTuple):
@@ -47,6 +46,8 @@ class NetworkAnswers(Answers):
         ValueError: an option is wrong, or does not fit the view or the network.
     """
 
+    most_lenses = 8  # a plan of tiles takes 100 MB
+
     def __init__(
         self, network: str, *, view: str | None = None, size: tuple[int, int] | None = None,
         fov_deg: float | None = None, up: Sequence[float] | None = None,
@@ -54,7 +55,9 @@ class NetworkAnswers(Answers):
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
-        check("threshold", lowest, math.isfinite(lowest), "a finite number")
+        for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
+            given = ",".join(f"{value:g}" for value in values)
+            check(name, given, all(map(math.isfinite, values)), "finite")
         make = partial(_view, view or VIEW, fov_deg, up, mean or (0.0,), std or (1.0,))
         # The network says how large its pictures are, but the view how many there are.
         try:
@@ -146,15 +149,15 @@ class NetworkAnswers(Answers):
         colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
         texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
         picture = draw_boxes(image, carried, texts, colors)
-        angles = np.degrees(
-            np.stack([there.azimuth, there.elevation, there.width, there.height], 1)
-        )
         columns = {
             "label": names,
             "score": _rounded(scores, 4),
             "box": _rounded(carried, 2),
             "visible": _rounded(visible, 4),
-            **dict(zip(ANGLES, _rounded(angles.T, 3), strict=True)),
+            **{
+                f"{angle}_deg": _rounded(np.degrees(getattr(there, angle)), 3)
+                for angle in ("azimuth", "elevation", "width", "height")
+            },
             "ray": _rounded(there.ray, 6),
         }
         entries = [

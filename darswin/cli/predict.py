@@ -92,8 +92,9 @@ def predict(
             lens sees.
         up: the direction away from gravity, as x right, y down and z forward of the camera. The
             default is the top of the picture, 0,-1,0.
-        mean, std: the normalization that the network expects, (pixel/255 - mean) / std, one number
-            or one for each channel. The defaults, 0 and 1, give it numbers from 0 to 1.
+        mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
+            one for each channel. The default is 0.
+        std: the same for std. The default is 1.
         channels: the order of colours that the network expects. The default is rgb.
         threshold: the lowest score of boxes. The default is 0.3.
         labels: a file with the names of the network's classes, from class 0: a text file with a

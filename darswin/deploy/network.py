@@ -62,7 +62,7 @@ class OnnxNetwork:
         ModuleNotFoundError: onnxruntime is not installed.
         ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
             no known form, or the size is missing or not that of the graph.
-        FloatingPointError: in a call, the network computes NaN.
+        FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
 
     Attributes:
         size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
@@ -156,8 +156,10 @@ class OnnxNetwork:
             put.name: np.asarray(value)[None] if self._is_single else np.asarray(value)
             for put, value in zip(self._session.get_outputs(), values, strict=True)
         }
-        found = self._detections(outputs, len(pictures))
-        found = self._others(outputs, len(pictures)) if found is None else found
+        found: list[Any] | None = []
+        if all(value.dtype.kind in "biuf" for value in outputs.values()):
+            found = self._detections(outputs, len(pictures))
+            found = self._others(outputs, len(pictures)) if found is None else found
         if not found:
             given = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
             raise ValueError(f"{self.path} has the outputs {', '.join(given)}; {_KNOWN}")
@@ -187,7 +189,7 @@ class OnnxNetwork:
         """The detections of one picture whose score is high enough."""
         keep = ~(found[1] < self.threshold)
         boxes, scores, labels = (values[keep].astype(np.float64) for values in found)
-        self._check_numbers(boxes, scores, labels)
+        self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
         if (labels % 1).any():
             raise ValueError(f"{self.path} finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
         if len(boxes) and boxes.max() <= 1:
@@ -213,8 +215,8 @@ class OnnxNetwork:
         return [{name: values[k] for name, values in found.items()} for k in range(count)]
 
     def _check_numbers(self, *outputs: np.ndarray) -> None:
-        if any(np.isnan(values).any() for values in outputs):
-            raise FloatingPointError(f"{self.path} computes NaN")
+        if not all(np.isfinite(values).all() for values in outputs):
+            raise FloatingPointError(f"{self.path} computes NaN or infinity")
 
 
 def _session(path: str) -> Any:

@@ -126,6 +126,10 @@ def test_the_size_is_the_graphs_or_given(tmp_path):
     ("outputs", "said"),
     [
         ("undecoded", r"has the outputs output0 \(1, 4, 7\); known are boxes \(B, N, 4\).*decoder"),
+        (
+            "texts",
+            r"has the outputs labels \(1, 1\), boxes \(1, 1, 4\), scores \(1, 1\); known are",
+        ),
         ("boxes of other shape", r"boxes \(1, 1, 6\), scores \(1, 1\), labels \(1, 1\); known are"),
     ],
 )
@@ -164,6 +168,12 @@ def test_wrong_numbers_are_told(tmp_path):
         OnnxNetwork(path)(lit)
     with pytest.raises(FloatingPointError, match="computes NaN"):
         OnnxNetwork(write_graph(tmp_path / "n.onnx", "nan", size=SIZE))
+    for form in ("infinite scores", "infinite"):
+        path = write_graph(tmp_path / "inf.onnx", form, size=SIZE)
+        with pytest.raises(FloatingPointError, match="computes NaN or infinity"):
+            OnnxNetwork(path)(lit)
+    path = write_graph(tmp_path / "b.onnx", "infinite boxes", size=SIZE)
+    assert np.isinf(OnnxNetwork(path)(lit)[0].boxes).all()
     path = write_graph(tmp_path / "swapped.onnx", "class before score", size=SIZE)
     with pytest.raises(ValueError, match=r"finds the class 0\.8.*x1, y1, score and class"):
         OnnxNetwork(path)(lit)
