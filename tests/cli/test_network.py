@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from graphs import write_graph

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from graphs import DETECTORS, write_graph
