@@ -47,8 +47,8 @@ def detections_to_images(
     Returns:
         For each image, the same dicts. The boxes are cut at the borders of the image, and those of
         several tiles are merged, the best first. "visible" (K,) is the share of each box that
-        the image shows, and boxes that it does not show are left out. "rays" (K, 3) are the directions of
-        the middles in the camera's frame, unless the view ignores the lens.
+        the image shows, and boxes that it does not show are left out. "rays" (K, 3) are the
+        directions of the middles in the camera's frame, unless the view ignores the lens.
     """
     if len(found) % view.count:
         raise ValueError(
