@@ -20,7 +20,7 @@ PICTURE_TOP = (0.0, -1.0, 0.0)
 AXIS = (0.0, 0.0, 1.0)
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
 _STEPS = 361  # points at which the end of what a lens sees is looked for
-_BISECTIONS = 16
+_BISECTIONS = 12
 _APART = 1.5  # pixels of the image between points at which it is read
 _MOST_READS = 4
 
@@ -56,7 +56,7 @@ class RayView(PixelView):
 
     size: Pair
     upright = False  # True if all columns are vertical in the world, and not only the middle one
-    at_horizon = False  # True if a view of a whole lens is near the horizon, not at `direction`
+    around = False  # True if a view shows all around the horizon, and not as much as the lens
     reach = math.pi  # the largest angle from the middle that a view of a whole lens shows, rad
     widest = 2 * math.pi  # the largest fov
 
@@ -195,25 +195,23 @@ class RayView(PixelView):
         # Upright views are as wide as the lens sees on the horizon, if it sees that at all.
         horizon = torch.zeros_like(start)
         row = torch.where(self._sees(lens, horizon[None], size)[..., None], horizon, start)[:, 0]
-        left, right = self._across(lens, row, size)
-        upper, lower = (
-            self._end(lens, start, self._highest(start, sign), size)[:, 1] for sign in (-1, 1)
-        )
+        edge = row.new_tensor([self.half_width(self.reach), 0.0])
+        begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
+        ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
+        goals = torch.stack(torch.broadcast_tensors(*ends), 1)
+        seen = self._seen_ends(lens, begins, goals, size)
+        left, right, upper, lower = *seen[:, :2, 0].unbind(1), *seen[:, 2:, 1].unbind(1)
+        if self.around:
+            left, right = torch.full_like(left, -math.pi), torch.full_like(right, math.pi)
         step = (right - left) / self.size[1]
         if not self.upright:
             step = torch.maximum(step, (lower - upper) / self.size[0])
         half = step * (self.size[0] / 2)
         first, last = upper + half, lower - half  # of the middles that show nothing unseen
-        wanted = (horizon if self.at_horizon else start)[:, 1]
+        wanted = (horizon if self.around else start)[:, 1]
         y = torch.minimum(torch.maximum(wanted, first), last)
         y = torch.where(first <= last, y, (upper + lower) / 2)
         return step[:, None], torch.stack(((left + right) / 2, y), -1)
-
-    def _across(self, lens: Lens, row: Tensor, size: Pair) -> tuple[Tensor, Tensor]:
-        """The ends (N,) of what a lens sees along the row at points (N or 1, 2) of the plane."""
-        edge = self.half_width(self.reach)
-        left, right = (row + row.new_tensor([x, 0.0]) for x in (-edge, edge))
-        return self._end(lens, row, left, size)[:, 0], self._end(lens, row, right, size)[:, 0]
 
     def _start(self, like: Tensor) -> Tensor:
         """The point of the plane (1, 2) at `direction`, or at its nearest elevation that is not too
@@ -231,22 +229,25 @@ class RayView(PixelView):
         steepest = (0.0, sign * math.sin(_STEEPEST), math.cos(_STEEPEST))
         return self.to_plane(start.new_tensor([steepest]))
 
-    def _end(self, lens: Lens, start: Tensor, end: Tensor, size: Pair) -> Tensor:
-        """The last point of the plane that the images show from one point (N or 1, 2) to another,
-        (N, 2)."""
-        shares = torch.linspace(0, 1, _STEPS, dtype=start.dtype, device=start.device)
+    def _seen_ends(self, lens: Lens, begins: Tensor, ends: Tensor, size: Pair) -> Tensor:
+        """The last points of the plane that the images show on the ways from K points (N or 1, K,
+        2) to K others, (N, K, 2)."""
+        shares = torch.linspace(0, 1, _STEPS, dtype=begins.dtype, device=begins.device)
 
-        def at(share: Tensor) -> Tensor:
-            return start[:, None] + (end - start)[:, None] * share[..., None]
+        def at(share: Tensor) -> Tensor:  # (N or 1, K, J) → (N or 1, K, J, 2)
+            return begins[:, :, None] + (ends - begins)[:, :, None] * share[..., None]
 
-        seen = self._sees(lens, at(shares[None]), size)
-        count = seen.int().cumprod(1).sum(1, keepdim=True)
+        def sees(share: Tensor) -> Tensor:
+            points = at(share)
+            return self._sees(lens, points.flatten(1, 2), size).unflatten(1, points.shape[1:3])
+
+        count = sees(shares[None, None]).int().cumprod(2).sum(2, keepdim=True)
         low, high = (shares[(count + k).clamp(0, _STEPS - 1)] for k in (-1, 0))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            inside = self._sees(lens, at(middle), size)
+            inside = sees(middle)
             low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-        return at(low)[:, 0]
+        return at(low)[:, :, 0]
 
     def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:
         """True where images of (H, W) show points (N or 1, K, 2) of the plane, (N, K)."""
