@@ -12,20 +12,16 @@ the corners are mostly empty, so a rectangle would grow with every step.
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    Array = np.ndarray | Tensor
-
 __all__ = [
-    "SphericalBoxes", "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "cut_polygon",
+    "SphericalBoxes", "carry", "carry_mask", "carry_points", "carry_polygon", "clip",
     "decode_rle", "encode_rle", "iou", "merge", "spherical",
 ]  # fmt: skip
 
+Array = Any  # a NumPy array, a tensor, or lists of numbers
 PointMap = Callable[[np.ndarray], np.ndarray]
 
 _ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
@@ -38,7 +34,7 @@ _ROWS = 512  # boxes that are compared with all others at once, to bound the mem
 # -- through a map of points --------------------------------------------------------------------
 
 
-def carry(boxes: "Array", points_map: PointMap) -> tuple[Any, Any]:
+def carry(boxes: Array, points_map: PointMap) -> tuple[Any, Any]:
     """Carries boxes through a point map, by the ellipses inside them.
 
     Args:
@@ -57,7 +53,7 @@ def carry(boxes: "Array", points_map: PointMap) -> tuple[Any, Any]:
     return _like(boxes, carried), _like(boxes, visible)
 
 
-def carry_points(points: "Array", points_map: PointMap) -> Any:
+def carry_points(points: Array, points_map: PointMap) -> Any:
     """Carries points (..., 2) through a point map; NaN where nothing is seen."""
     table = _floats(points)
     if table.shape[-1:] != (2,):
@@ -65,7 +61,7 @@ def carry_points(points: "Array", points_map: PointMap) -> Any:
     return _like(points, _through(points_map, table))
 
 
-def carry_polygon(polygon: "Array", points_map: PointMap, step: float = _STEP) -> Any:
+def carry_polygon(polygon: Array, points_map: PointMap, step: float = _STEP) -> Any:
     """Carries a polygon (P, 2) through a point map, its sides cut into pieces of at most `step` px.
 
     Returns:
@@ -90,7 +86,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
     return np.where(share > 0, polygon[side] + share * sides[side], polygon[side])
 
 
-def carry_mask(mask: "Array", to_old: PointMap, size: tuple[int, int]) -> Any:
+def carry_mask(mask: Array, to_old: PointMap, size: tuple[int, int]) -> Any:
     """Carries a mask: each new pixel has the value of the nearest old one, or 0 beyond.
 
     Args:
@@ -112,13 +108,13 @@ def carry_mask(mask: "Array", to_old: PointMap, size: tuple[int, int]) -> Any:
 # -- in a picture -------------------------------------------------------------------------------
 
 
-def clip(boxes: "Array", size: tuple[int, int]) -> Any:
+def clip(boxes: Array, size: tuple[int, int]) -> Any:
     """Cuts boxes (K, 4) at the borders of a picture of (H, W); NaN stays NaN."""
     height, width = size
     return _like(boxes, np.clip(_table(boxes), 0.0, [width, height, width, height]))
 
 
-def iou(boxes: "Array", others: "Array") -> Any:
+def iou(boxes: Array, others: Array) -> Any:
     """The intersection over the union of each box (K, 4) with each of the others (L, 4): (K, L),
     0 for boxes that are NaN or have no area."""
     a, b = _table(boxes)[:, None], _table(others)[None]
@@ -127,7 +123,7 @@ def iou(boxes: "Array", others: "Array") -> Any:
 
 
 def merge(
-    boxes: "Array", scores: "Array", labels: "Array", *, iou: float = 0.5, inside: float = 0.7
+    boxes: Array, scores: Array, labels: Array, *, iou: float = 0.5, inside: float = 0.7
 ) -> Any:
     """Merges the detections of several views of one picture.
 
@@ -197,7 +193,7 @@ class SphericalBoxes(NamedTuple):
     solid_angle: Any
 
 
-def spherical(boxes: "Array", to_rays: PointMap) -> SphericalBoxes:
+def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     """Boxes (K, 4) of a picture as directions and angles, by the ellipses inside them.
 
     Args:
@@ -239,7 +235,7 @@ def _looking(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 # -- COCO's run-length encoding -------------------------------------------------------------------
 
 
-def encode_rle(mask: "Array", *, compressed: bool = True) -> dict[str, Any]:
+def encode_rle(mask: Array, *, compressed: bool = True) -> dict[str, Any]:
     """A mask (H, W) in COCO's run-length encoding: {"size": [H, W], "counts": text, or a list of
     numbers unless `compressed`}.
 
