@@ -217,6 +217,10 @@ class PixelView(View):
         """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
         raise NotImplementedError
 
+    def reads_of(self, size: Pair) -> int:
+        """The points along each side of a pixel at which images of (H, W) are read."""
+        return 1
+
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN
         where the view shows nothing. size: (H, W) of the images of N lenses."""
@@ -338,6 +342,15 @@ def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
             f"sampled must have the size of the view, (H, W) = {size}, got {tuple(seen.shape[2:])}"
         )
     return seen
+
+
+def check_one_picture(view: View) -> None:
+    """ValueError for a view that shows several pictures of each image."""
+    if view.count != 1:
+        raise ValueError(
+            f"this model takes one picture of each image, but the view shows {view.count}: put a "
+            "network behind them with LensAdapter"
+        )
 
 
 def check_lens(lens: Lens | None, size: Pair) -> Lens:
