@@ -47,10 +47,17 @@ def carry(boxes: Array, points_map: PointMap) -> tuple[Any, Any]:
     Raises:
         ValueError: boxes of another shape.
     """
-    found = _through(points_map, _ellipses(boxes))
+    found = _through(points_map, ellipses(boxes))
     visible = np.isfinite(found[..., 0]).mean(1)
     carried = np.concatenate((np.fmin.reduce(found, axis=1), np.fmax.reduce(found, axis=1)), 1)
     return _like(boxes, carried), _like(boxes, visible)
+
+
+def ellipses(boxes: Array) -> np.ndarray:
+    """The points of the ellipses inside boxes, (K, 72, 2); NaN for boxes that are not finite."""
+    table = _table(boxes)
+    table = np.where(np.isfinite(table), table, np.nan)[:, None]
+    return table[..., :2] + (table[..., 2:] - table[..., :2]) * _ELLIPSE
 
 
 def carry_points(points: Array, points_map: PointMap) -> Any:
@@ -200,7 +207,7 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
         to_rays: a function from points (..., 2), in darswin's pixels, to rays (..., 3), NaN or 0
             where nothing is seen. Only the seen points count; without any, all is NaN.
     """
-    rays = np.asarray(to_rays(_ellipses(boxes) - 0.5), np.float64)
+    rays = np.asarray(to_rays(ellipses(boxes) - 0.5), np.float64)
     length = np.linalg.norm(rays, axis=-1, keepdims=True)
     rays = np.divide(rays, length, out=np.full(rays.shape, np.nan), where=length > 0)
     ray = np.nan_to_num(rays).sum(1)
@@ -336,13 +343,6 @@ def _table(boxes: Any) -> np.ndarray:
     if table.ndim != 2 or table.shape[1] != 4:
         raise ValueError(f"boxes must have shape (K, 4), got {_shape(table)}")
     return table
-
-
-def _ellipses(boxes: Any) -> np.ndarray:
-    """The points of the ellipses inside boxes, (K, 72, 2); NaN for boxes that are not finite."""
-    table = _table(boxes)
-    table = np.where(np.isfinite(table), table, np.nan)[:, None]
-    return table[..., :2] + (table[..., 2:] - table[..., :2]) * _ELLIPSE
 
 
 def _shape(array: np.ndarray) -> str:

@@ -2,13 +2,15 @@
 
 import math
 import warnings
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.utils.parameters import check
+from darswin.utils.parameters import check, naming
+from darswin.views import PixelView, make_view
 from darswin.viz.report import sides
 
 View = Literal["perspective", "cylindrical", "equirectangular", "square"]
@@ -72,6 +74,28 @@ def view_rays(
 
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
     return getattr(views, view)(size, fov, yaw=yaw, pitch=pitch)
+
+
+def named_view(
+    parameter: str, spec: str, size: tuple[int, int], fov_deg: float | None = None,
+    up: Sequence[float] | None = None, mean: Any = 0.0, std: Any = 1.0,
+) -> PixelView:  # fmt: skip
+    """The view NAME or NAME:COUNT of (H, W) that a `parameter` names, for networks."""
+    name, _, count = spec.partition(":")
+    options: dict[str, Any] = {"up": up}
+    if count:
+        check(parameter, spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
+        options["count"] = int(count)
+    if fov_deg is not None:
+        check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
+        options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
+    try:
+        view = make_view(name, size, mean=mean, std=std, **options)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(view, PixelView):
+        raise naming(ValueError(f"`{parameter}` {name} shows no picture to a network"), parameter)
+    return view
 
 
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:

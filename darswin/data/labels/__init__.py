@@ -1,0 +1,48 @@
+"""Labels of things: boxes, outlines, masks and keypoints, and the files of data sets."""
+
+from pathlib import Path
+
+from darswin.data.labels.coco import read_coco, write_coco
+from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Labels, Thing, moved
+from darswin.data.labels.woodscape import BOXES, has_boxes, read_woodscape_boxes
+from darswin.data.labels.yolo import is_yolo, read_yolo, write_yolo
+from darswin.utils.text import is_json_file
+
+__all__ = [
+    "LEAST_VISIBLE",
+    "LabelledPictures",
+    "Labels",
+    "Thing",
+    "moved",
+    "open_labels",
+    "read_coco",
+    "read_woodscape_boxes",
+    "read_yolo",
+    "write_coco",
+    "write_yolo",
+]
+
+
+def open_labels(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
+    """The pictures of a data set and their things.
+
+    Args:
+        path: a COCO file, or a folder in the form of YOLO or of WoodScape with its boxes.
+        pictures: the folder of the pictures of a COCO file, see `read_coco`.
+
+    Raises:
+        FileNotFoundError: another path, or missing files.
+        ValueError: wrong files, as the functions that read them say.
+    """
+    root = Path(path)
+    if is_json_file(root):
+        return read_coco(root, pictures)
+    if pictures is not None:
+        raise ValueError(f"`pictures` goes with a COCO file, but {root} is none")
+    for recognizes, read in ((has_boxes, read_woodscape_boxes), (is_yolo, read_yolo)):
+        if recognizes(root):
+            return read(root)
+    raise FileNotFoundError(
+        f"no labels in {root}: give a COCO file, instances.json; or a folder with data.yaml, as "
+        f"YOLO has; or with rgb_images/ and {BOXES}/, as WoodScape has"
+    )
