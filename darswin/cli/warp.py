@@ -24,7 +24,7 @@ from darswin.data.labels.yolo import is_yolo
 from darswin.data.reframing import Warped
 from darswin.data.warping import picture_size
 from darswin.lens import Lens, save, to_dict
-from darswin.lens.files.load import Calibration
+from darswin.lens.files.load import Calibration, to_corners
 from darswin.lens.files.opencv import Coefficients
 from darswin.utils.files import remove_partial_files, replace_file
 from darswin.utils.image import (
@@ -92,8 +92,10 @@ def warp(
         text = f"missing `lens`: {source} has no calibration, so give that of its camera"
         raise naming(ValueError(text), "lens")
     in_yolo = is_yolo(Path(source))
-    settings = dict(source=os.path.abspath(source), lens=lens, camera=camera,
-                    coefficients=coefficients, to=to, size=size, fov_deg=fov_deg, up=up)  # fmt: skip
+    settings = dict(
+        source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
+        camera=camera, coefficients=coefficients,
+    )  # fmt: skip
     folder = _claim(out, settings)
     work = _Work(replace(data, files=(), raw=(), entries=()), target,
                  folder if in_yolo else folder / PICTURES)  # fmt: skip
@@ -122,34 +124,34 @@ class _InView:
 
     def __init__(self, view: PixelView, lens: Lens, old: tuple[int, int], tile: int):
         assert view.size is not None
-        self.size, self._view, self._of = view.size, view, (lens, old)
+        self.size, self._view, self._lens, self._old = view.size, view, lens, old
         self._tile = {"tile": tile} if view.count > 1 else {}
 
     def to_new(self, points: np.ndarray) -> np.ndarray:
-        return self._view.to_view(points, *self._of, **self._tile)
+        return self._view.to_view(points, self._lens, self._old, **self._tile)
 
     def target(self, target: np.ndarray) -> np.ndarray:
         return carry_mask(target, lambda _: self._places, self.size)
 
     @cached_property
     def _places(self) -> np.ndarray:
-        grid = np.stack(np.mgrid[: self.size[0], : self.size[1]][::-1], -1).astype(float)
-        return self._view.to_image(grid, *self._of, **self._tile)
+        y, x = np.mgrid[: self.size[0], : self.size[1]].astype(float)
+        return self._view.to_image(np.stack((x, y), -1), self._lens, self._old, **self._tile)
 
 
 class _Maps:
     """What pictures of one lens become: pictures of another lens, or of a view."""
 
     def __init__(self, lens: Lens, target: Lens | PixelView):
-        self.lens, old = lens, picture_size(lens)
-        self.said = json.dumps(to_dict(lens))
+        self.lens, self.seen, old = lens, to_corners(lens), picture_size(lens)
+        self.said = json.dumps(to_dict(self.seen))
         if isinstance(target, Lens):
-            warped = Warped(lens, target)
+            warped = Warped(self.seen, target)
             self.moves: list[Move] = [warped]
             self.images = lambda image: [warped.image(image)]
             return
-        self.moves = [_InView(target, lens, old, k) for k in range(target.count)]
-        prepared = target.prepare(lens, old, back=False, rays=False)
+        self.moves = [_InView(target, self.seen, old, k) for k in range(target.count)]
+        prepared = target.prepare(self.seen, old, back=False, rays=False)
 
         def images(image: np.ndarray) -> list[np.ndarray]:
             seen = target.see(torch.from_numpy(image.transpose(2, 0, 1).copy())[None], prepared)
@@ -252,7 +254,7 @@ def _target(
     lens = calibration.lens(image_size=size)
     if lens.image_size is None:
         raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
-    return lens if size is None else lens.in_picture(size)
+    return to_corners(lens if size is None else lens.in_picture(size))
 
 
 def _claim(out: str, settings: dict[str, Any]) -> Path:

@@ -169,7 +169,7 @@ def _thing(annotation: Mapping[str, Any], path: str, mirrors: Mapping, size: Siz
         try:
             table = np.asarray(values, float).reshape(-1, group)
         except (TypeError, ValueError):
-            table = np.full((0, group), math.nan)
+            table = np.full((1, group), math.nan)
         if len(table) < least or not np.isfinite(table).all():
             raise ValueError(
                 f"{path}: the annotation {annotation.get('id')} has the {name} "

@@ -16,6 +16,7 @@ Size = tuple[int, int]
 # A thing of which a smaller share is visible in the new picture is left out. The share counts from
 # the picture that people labelled, so it adds up over several moves.
 LEAST_VISIBLE = 0.2
+_NO_AREA = 1e-6  # px², of rounding
 _SAMPLES = 1000  # pixels of a mask by which its visible share is measured
 
 
@@ -133,12 +134,12 @@ def _with_outlines(
     parts, seen = [], 0.0
     for before, after in zip(old, new, strict=True):
         whole = _parts(after, size[1])
-        cut = [_cut(part, size) for part in whole]
-        if area := sum(map(_area, whole)):
-            share = np.isfinite(after[:, 0]).mean() * sum(map(_area, cut)) / area
+        cut = max((_cut(part, size) for part in whole), key=_area)
+        if _area(cut) > _NO_AREA:
+            share = np.isfinite(after[:, 0]).mean() * _area(cut) / sum(map(_area, whole))
             seen += share * _area(before)
-        parts += [part for part in cut if _area(part) > 0]
-    visible = thing.visible * seen / (sum(map(_area, old)) or 1.0)
+            parts.append(cut)
+    visible = thing.visible * min(seen / max(sum(map(_area, old)), _NO_AREA), 1.0)
     if not parts or visible < LEAST_VISIBLE:
         return None
     corners = np.concatenate(parts)
@@ -175,7 +176,7 @@ def _is_inside(points: np.ndarray, size: Size) -> np.ndarray:
 
 def _parts(outline: np.ndarray, width: int) -> list[np.ndarray]:
     """The points of an outline that are seen. It becomes several if it jumps from one end of a view
-    all around to the other."""
+    all around to the other: the larger one of them is kept, because a box has one place."""
     ahead = np.abs(np.roll(outline[:, 0], -1) - outline[:, 0])
     jumps = np.flatnonzero(ahead > width / 2)  # not for NaN
     parts = [outline]
