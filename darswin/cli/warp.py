@@ -43,6 +43,7 @@ from darswin.views import PixelView, list_views
 RECORD, LENS, VIEW, LEFT = "warp.json", "lens.json", "view.json", "left.json"
 COCO, PICTURES = "annotations.json", "images"
 _SIZE = (512, 512)  # of a view
+_NAMED = 10  # pictures that cannot be read
 _KEPT = 8  # lenses whose maps are in memory
 
 
@@ -173,7 +174,8 @@ class _Work:
         try:
             return self._warped(file, raw)
         except (BrokenImageError, ValueError) as error:
-            return _Warped(error=with_flags(error))
+            said = with_flags(error)
+            return _Warped(error=said if file in said else f"{file}: {said}")
 
     def _warped(self, file: str, raw: Any) -> _Warped:
         assert self.data.lenses is not None
