@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from darswin.boxes import decode_rle
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing
+from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing, box_of_mask
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
@@ -56,12 +57,12 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         for annotation in content["annotations"]:
             if (category := annotation["category_id"]) not in mirrors:
                 raise ValueError(
-                    f"{path}: the annotation {annotation['id']} has the category {category!r}, but "
-                    f"the categories are {some(list(mirrors))}"
+                    f"{path}: the annotation {annotation.get('id')} has the category {category!r}, "
+                    f"but the categories are {some(list(mirrors))}"
                 )
             if (picture := annotation["image_id"]) not in of_picture:
                 raise ValueError(
-                    f"{path}: the annotation {annotation['id']} is of the picture {picture!r}, "
+                    f"{path}: the annotation {annotation.get('id')} is of the picture {picture!r}, "
                     "which the file does not list"
                 )
             of_picture[picture].append(annotation)
@@ -188,6 +189,8 @@ def _thing(annotation: Mapping[str, Any], path: str, mirrors: Mapping, size: Siz
     if "bbox" in annotation:
         x, y, width, height = numbers("box", annotation["bbox"], 4)[0]
         box = np.array([x, y, x + width, y + height])
+    elif rle is not None:
+        box = box_of_mask(decode_rle(rle))
     elif polygons:
         corners = np.concatenate(polygons)
         box = np.concatenate((corners.min(0), corners.max(0)))

@@ -156,10 +156,17 @@ def _with_mask(thing: Thing, move: Move) -> Thing | None:
     new = move.target(old.astype(np.uint8)) == 1
     if visible < LEAST_VISIBLE or not new.any():
         return None
-    rows, columns = np.flatnonzero(new.any(1)), np.flatnonzero(new.any(0))
-    box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
+    box = box_of_mask(new)
     rle = encode_rle(new, compressed=isinstance(thing.rle["counts"], str))
     return replace(thing, box=box, rle=rle, visible=visible)
+
+
+def box_of_mask(mask: np.ndarray) -> np.ndarray:
+    """The box (4,) of the pixels of a mask (H, W); all 0 if there are none."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return np.zeros(4)
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
 
 
 def _keypoints(thing: Thing, places: np.ndarray, move: Move) -> np.ndarray:

@@ -157,6 +157,16 @@ def test_wrong_coco_files(tmp_path, changes, said):
         read_coco(write(tmp_path, **changes)).labels(0)
 
 
+def test_boxes_that_are_missing_are_those_of_polygons_and_masks(tmp_path):
+    annotations = [
+        {k: v for k, v in one.items() if k not in ("bbox", "id")} for one in ANNOTATIONS[1:]
+    ]
+    data = read_coco(write(tmp_path, annotations=annotations))
+    polygon, crowd = data.labels(0).things
+    np.testing.assert_array_equal(polygon.box, [1, 2, 21, 12])
+    np.testing.assert_array_equal(crowd.box, [30, 10, 50, 20])
+
+
 def test_empty_coco_files(tmp_path):
     assert not read_coco(write(tmp_path, annotations=[])).labels(0).things
     assert len(read_coco(write(tmp_path, images=[], annotations=[], categories=[]))) == 0
