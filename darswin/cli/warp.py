@@ -38,7 +38,7 @@ from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
 from darswin.utils.text import read_json
-from darswin.views import PixelView, list_views
+from darswin.views import PixelView, RayView, list_views
 
 RECORD, LENS, VIEW, LEFT = "warp.json", "lens.json", "view.json", "left.json"
 COCO, PICTURES = "annotations.json", "images"
@@ -125,7 +125,8 @@ class _InView:
 
     def __init__(self, view: PixelView, lens: Lens, old: tuple[int, int], tile: int):
         assert view.size is not None
-        self.size, self._view, self._lens, self._old = view.size, view, lens, old
+        self.size, self._lens, self._old = view.size, lens.to(torch.float64), old
+        self._view = view.for_lens(self._lens, old) if isinstance(view, RayView) else view
         self._tile = {"tile": tile} if view.count > 1 else {}
 
     def to_new(self, points: np.ndarray) -> np.ndarray:

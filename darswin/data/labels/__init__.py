@@ -6,6 +6,7 @@ from darswin.data.labels.coco import read_coco, write_coco
 from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Labels, Thing, moved
 from darswin.data.labels.woodscape import BOXES, has_boxes, read_woodscape_boxes
 from darswin.data.labels.yolo import is_yolo, read_yolo, write_yolo
+from darswin.utils.parameters import naming
 from darswin.utils.text import is_json_file
 
 __all__ = [
@@ -38,7 +39,8 @@ def open_labels(path: str | Path, pictures: str | Path | None = None) -> Labelle
     if is_json_file(root):
         return read_coco(root, pictures)
     if pictures is not None:
-        raise ValueError(f"`pictures` goes with a COCO file, but {root} is none")
+        text = f"`pictures` goes with a COCO file, but {root} is none"
+        raise naming(ValueError(text), "pictures")
     for recognizes, read in ((has_boxes, read_woodscape_boxes), (is_yolo, read_yolo)):
         if recognizes(root):
             return read(root)
