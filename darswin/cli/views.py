@@ -8,7 +8,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from darswin.lens.base import Lens
+from darswin.lens import BrownConrady, Lens, Perspective
+from darswin.lens.files.load import reach
 from darswin.utils.parameters import check, naming
 from darswin.views import PixelView, make_view
 from darswin.viz.report import sides
@@ -74,6 +75,19 @@ def view_rays(
 
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
     return getattr(views, view)(size, fov, yaw=yaw, pitch=pitch)
+
+
+def to_corners(lens: Lens) -> Lens:
+    """A pinhole camera up to the corners of its picture, since it has no image circle; another
+    lens, or a distorted one with a θ_max of its own, as it is."""
+    whole = lens.with_theta_max(None)
+    distorted = isinstance(lens, BrownConrady) and (lens.theta_max - reach(whole)).abs() < 1e-5
+    if lens.image_size is None or not (isinstance(lens, Perspective) or distorted):
+        return lens
+    height, width = (lens.image_size[0] - 0.5).tolist()
+    corners = [[x, y] for x in (-0.5, width) for y in (-0.5, height)]
+    theta = whole.theta_and_direction(lens.theta_max.new_tensor([corners]))[0]
+    return lens.with_theta_max(theta.nan_to_num(whole.theta_max.item()).max().item())
 
 
 def named_view(

@@ -3,8 +3,10 @@
 import json
 import multiprocessing
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,7 +18,8 @@ import numpy as np
 import torch
 
 from darswin.boxes import carry_mask
-from darswin.cli.views import named_view
+from darswin.cli.predict import is_below
+from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
 from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Move, move_things
@@ -24,7 +27,7 @@ from darswin.data.labels.yolo import is_yolo
 from darswin.data.reframing import Warped
 from darswin.data.warping import picture_size
 from darswin.lens import Lens, save, to_dict
-from darswin.lens.files.load import Calibration, to_corners
+from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
 from darswin.utils.files import remove_partial_files, replace_file
 from darswin.utils.image import (
@@ -92,10 +95,13 @@ def warp(
     if data.lenses is None:
         text = f"missing `lens`: {source} has no calibration, so give that of its camera"
         raise naming(ValueError(text), "lens")
+    if is_below(out, source):
+        raise ValueError(f"--out must be a folder outside of {source}, got {out}")
     in_yolo = is_yolo(Path(source))
     settings = dict(
         source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
         camera=camera, coefficients=coefficients,
+        target=to_dict(target) if isinstance(target, Lens) else None,
     )  # fmt: skip
     folder = _claim(out, settings)
     work = _Work(replace(data, files=(), raw=(), entries=()), target,
@@ -190,7 +196,9 @@ class _Work:
         if not all((self.folder / file).is_file() for file in files):
             image, orientation = read_oriented(name, header.channels)
             if (image.shape[:2], orientation) != (header.upright, header.orientation):
-                raise BrokenImageError(f"cannot read {name}: its orientation is behind its pixels")
+                raise BrokenImageError(
+                    f"cannot read {name}: its orientation stands behind its pixels"
+                )
             for file, picture in zip(files, maps.images(image), strict=True):
                 write_image(self.folder / file, picture)
         moved = [move_things(labels.things, move) for move in maps.moves]
@@ -223,6 +231,9 @@ def _pool(work: _Work, processes: int) -> Iterator[Callable[..., Iterable[_Warpe
     with ProcessPoolExecutor(processes, context, _start, (work, os.getpid())) as pool:
         try:
             yield partial(pool.map, _one, chunksize=4)
+        except BrokenProcessPool as error:
+            text = "a process was ended, perhaps because the memory is full: use fewer `processes`"
+            raise naming(ChildProcessError(text), "processes") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -233,6 +244,7 @@ _work: list[_Work] = []  # of this process of a pool
 
 def _start(work: _Work, parent: int) -> None:
     die_with_parent(parent)
+    warnings.simplefilter("ignore")  # the first process opens the same calibrations
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     _work.append(work)
@@ -247,7 +259,10 @@ def _target(
 ) -> Lens | PixelView:
     """The new camera, or the view."""
     if to.partition(":")[0] in list_views():
-        return named_view("to", to, size or _SIZE, fov_deg, up)
+        view = named_view("to", to, size or _SIZE, fov_deg, up)
+        if not view.uses_lens:
+            raise naming(ValueError(f"`to` {to} shows the picture as it is"), "to")
+        return view
     for name, value in (("fov_deg", fov_deg), ("up", up)):
         check(name, value, value is None, "left out unless --to is a view")
     if not is_json(to) and not os.path.exists(to):
@@ -316,6 +331,6 @@ def _write(
             f"them is visible; {folder / LEFT} lists them"
         )
     if bad:
-        raise BrokenImageError(
-            f"{len(bad)} of {len(data)} pictures were left out:\n" + "\n".join(bad)
-        )
+        more = [f"and {len(bad) - _NAMED} more"] * (len(bad) > _NAMED)
+        said = "\n".join([*bad[:_NAMED], *more])
+        raise BrokenImageError(f"{len(bad)} of {len(data)} pictures were left out:\n{said}")

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from PIL import ExifTags, Image
 from scenes import write_woodscape
 
 from darswin import lens as lenses
@@ -131,6 +132,25 @@ def test_a_perspective_set_becomes_a_fisheye_set(wide, capsys):
     content = json.loads(wide.read_text())
     assert [one["id"] for one in content["annotations"]] == list(range(1, 10))
     assert [c["name"] for c in content["categories"]] == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"model": "Perspective", "fov_deg": 70},
+        {"model": "BrownConrady", "focal": 214.0, "radial": [-0.05, 0.01]},
+    ],
+)
+def test_a_flat_picture_is_used_up_to_its_corners(flat, tmp_path, lens):
+    """θ_max of such a lens is that of a side; a pinhole camera has no image circle."""
+    corner = {"bbox": [1, 1, 30, 20]}
+    source = edited(flat, tmp_path, lambda c: c["annotations"][0].update(segmentation=[], **corner))
+    wide = json.dumps({"model": "Equidistant", "fov_deg": 130, "image_size": [400, 400]})
+    file = warp(source, tmp_path / "out", wide, "--lens", json.dumps(lens))
+    first = json.loads(file.read_text())["annotations"][0]
+    assert first["id"] == 1 and first["visible"] == 1
+    picture = cv2.imread(str(tmp_path / "out" / "images" / "0.png"))
+    assert picture.shape == (400, 400, 3)
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -322,6 +342,7 @@ def edited(flat, folder, edit):
         ("tiles:3", ("--lens", FLAT), "count must be from 4 to 9"),
         ("mercator:2", ("--lens", FLAT), "has no such option"),
         ("polar", ("--lens", FLAT), "shows no picture"),
+        ("none", ("--lens", FLAT), "--to none shows the picture as it is"),
         (WIDE, ("--lens", FLAT, "--up", "0,1,0"), "--up must be left out unless --to is a view"),
         (WIDE, ("--lens", FLAT, "--processes", "0"), "--processes must be at least 1, got 0"),
         (WIDE, ("--lens", FLAT, "--size", "0,5"), "--size must be at least 1,1"),
@@ -371,6 +392,42 @@ def test_no_things_at_all(flat, tmp_path, capsys):
     file = warp(source, tmp_path / "out", WIDE, "--lens", FLAT)
     assert "3 pictures of 3, with 0 things" in capsys.readouterr().out
     assert json.loads(file.read_text())["annotations"] == []
+
+
+def test_many_errors_are_counted(tmp_path, capsys):
+    source = write_set(tmp_path / "in", 12)
+    for picture in (tmp_path / "in" / "images").iterdir():
+        picture.write_bytes(b"no picture")
+    text = refused(source, tmp_path / "out", WIDE, "--lens", FLAT, capsys=capsys)
+    assert text.count("cannot read") == 10 and text.endswith("and 2 more")
+
+
+def test_the_new_set_is_not_in_the_old_one(tmp_path, capsys):
+    root = write_woodscape(tmp_path / "woodscape", 2)
+    assert "--out must be a folder outside of" in refused(
+        root, root / "out", "mercator", capsys=capsys
+    )
+
+
+@pytest.mark.parametrize("to", [WIDE, "mercator", "tiles:4"])
+def test_grey_pictures_stay_grey(tmp_path, to):
+    source = write_set(tmp_path / "in", 1)
+    picture = tmp_path / "in" / "images" / "0.png"
+    cv2.imwrite(str(picture), cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE))
+    warp(source, tmp_path / "out", to, "--lens", FLAT)
+    for new in (tmp_path / "out" / "images").iterdir():
+        assert cv2.imread(str(new), cv2.IMREAD_UNCHANGED).ndim == 2
+
+
+def test_turned_pictures_are_turned_upright(tmp_path):
+    """By EXIF; sizes and labels are those of the upright picture."""
+    source = write_set(tmp_path / "in", 1, ("polygon",))
+    picture = tmp_path / "in" / "images" / "0.png"
+    stored = Image.fromarray(np.rot90(cv2.imread(str(picture))[..., ::-1]))
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # shown turned clockwise
+    stored.save(picture, exif=exif)
+    assert check_shown(warp(source, tmp_path / "out", WIDE, "--lens", FLAT), 0.75, 0.95) == 3
 
 
 def test_the_folder_of_the_pictures(flat, tmp_path, monkeypatch):

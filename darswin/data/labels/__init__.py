@@ -17,8 +17,6 @@ __all__ = [
     "moved",
     "open_labels",
     "read_coco",
-    "read_woodscape_boxes",
-    "read_yolo",
     "write_coco",
     "write_yolo",
 ]

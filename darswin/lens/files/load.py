@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens, from_dict, naming_degrees, with_rounded_theta_max
-from darswin.lens.distorted import BrownConrady
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
@@ -25,7 +24,6 @@ from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
-from darswin.lens.ideal import Perspective
 from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.files import replace_file
@@ -362,19 +360,6 @@ def _batch(
         left_top, size = sensor.split(2, 1)
         judged = judged.replace(center=judged.center_in() + left_top, image_size=size)
     return lens, doubts(judged)
-
-
-def to_corners(lens: Lens) -> Lens:
-    """A pinhole camera up to the corners of its picture, since it has no image circle; another
-    lens, or a distorted one with a θ_max of its own, as it is."""
-    whole = lens.with_theta_max(None)
-    distorted = isinstance(lens, BrownConrady) and (lens.theta_max - reach(whole)).abs() < 1e-5
-    if lens.image_size is None or not (isinstance(lens, Perspective) or distorted):
-        return lens
-    height, width = (lens.image_size[0] - 0.5).tolist()
-    corners = [[x, y] for x in (-0.5, width) for y in (-0.5, height)]
-    theta = whole.theta_and_direction(lens.theta_max.new_tensor([corners]))[0]
-    return lens.with_theta_max(theta.nan_to_num(whole.theta_max.item()).max().item())
 
 
 def reach(lens: Lens) -> Tensor:
