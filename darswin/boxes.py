@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 __all__ = [
-    "SphericalBoxes", "carry", "carry_mask", "carry_points", "carry_polygon", "clip",
-    "decode_rle", "encode_rle", "iou", "merge", "spherical",
+    "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "decode_rle", "encode_rle",
+    "iou", "merge", "spherical",
 ]  # fmt: skip
 
 Array = Any  # a NumPy array, a tensor, or lists of numbers
@@ -188,13 +188,7 @@ def merge(
 
 
 class SphericalBoxes(NamedTuple):
-    """Boxes as a camera sees them that looks at their middles, level with the camera's frame.
-
-    Shapes: azimuth and elevation of the middles (K,) rad, to the right and up from the optical
-    axis; width and height (K,) rad, the horizontal and the vertical angle of view; ray (K, 3), the
-    unit vectors of the middles in the camera's frame (x right, y down, z forward); solid_angle (K,)
-    sr, of the rectangle in that view.
-    """
+    """The result of `spherical`."""
 
     azimuth: Any
     elevation: Any
@@ -210,6 +204,13 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     Args:
         to_rays: a function from points (..., 2), in darswin's pixels, to rays (..., 3), NaN or 0
             where nothing is seen. Only the seen points count; without any, all is NaN.
+
+    Returns:
+        A named tuple of the boxes as a camera sees them that looks at their middles, level with the
+        camera's frame: azimuth and elevation of the middles (K,) rad, to the right and up from the
+        optical axis; width and height (K,) rad, the horizontal and the vertical angle of view; ray
+        (K, 3), the unit vectors of the middles in the camera's frame (x right, y down, z forward);
+        and solid_angle (K,) sr, of the rectangle in that view.
     """
     rays = np.asarray(to_rays(ellipses(boxes) - 0.5), np.float64)
     length = np.linalg.norm(rays, axis=-1, keepdims=True)

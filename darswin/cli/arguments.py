@@ -126,7 +126,7 @@ def _value(text: str, kind: Any) -> Any:
     values = values if isinstance(values, list) else [values]
     fixed = typing.get_origin(kind) is tuple
     if choices[0] is float:
-        values = [float(value) if type(value) is int else value for value in values]
+        values = [float(str(value)) for value in values]  # YAML takes 1e-3 for a text
     if any(type(value) is not choices[0] for value in values):
         raise ValueError
     if fixed and len(values) != len(choices):

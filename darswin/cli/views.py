@@ -91,12 +91,17 @@ def to_corners(lens: Lens) -> Lens:
 
 
 def named_view(
-    parameter: str, spec: str, size: tuple[int, int], fov_deg: float | None = None,
-    up: Sequence[float] | None = None, mean: Any = 0.0, std: Any = 1.0,
+    parameter: str, spec: str, size: tuple[int, int], *, fov_deg: float | None,
+    up: Sequence[float] | None, mean: Sequence[float] = (0.0,), std: Sequence[float] = (1.0,),
 ) -> PixelView:  # fmt: skip
     """The view NAME or NAME:COUNT of (H, W) that a `parameter` names, for networks."""
     name, _, count = spec.partition(":")
-    options: dict[str, Any] = {"up": up}
+    options: dict[str, Any] = {
+        key: values[0] if len(values) == 1 else values
+        for key, values in (("mean", mean), ("std", std))
+    }
+    if up is not None:
+        options["up"] = up
     if count:
         check(parameter, spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
         options["count"] = int(count)
@@ -104,7 +109,7 @@ def named_view(
         check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
         options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
     try:
-        view = make_view(name, size, mean=mean, std=std, **options)
+        view = make_view(name, size, **options)
     except TypeError as error:
         raise ValueError(str(error)) from error
     if not isinstance(view, PixelView):

@@ -259,7 +259,7 @@ def _target(
 ) -> Lens | PixelView:
     """The new camera, or the view."""
     if to.partition(":")[0] in list_views():
-        view = named_view("to", to, size or _SIZE, fov_deg, up)
+        view = named_view("to", to, size or _SIZE, fov_deg=fov_deg, up=up)
         if not view.uses_lens:
             raise naming(ValueError(f"`to` {to} shows the picture as it is"), "to")
         return view

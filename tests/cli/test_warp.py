@@ -381,7 +381,7 @@ def test_pictures_that_cannot_be_read_are_named_at_the_end(flat, tmp_path, capsy
 
 def test_a_view_that_sees_nothing_of_the_lens(flat, tmp_path, capsys, monkeypatch):
     behind = make_view("mercator", (64, 64), fov=0.5, direction=(0, 0, -1))
-    monkeypatch.setattr(module, "named_view", lambda *_: behind)
+    monkeypatch.setattr(module, "named_view", lambda *_, **options: behind)
     text = refused(flat, tmp_path / "out", "mercator", "--lens", FLAT, capsys=capsys)
     assert "3 of 3 pictures were left out" in text and text.count("\n") == 3, text
     assert all(f"{k}.png: this view sees nothing of the lens" in text for k in range(3))

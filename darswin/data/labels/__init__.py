@@ -3,20 +3,18 @@
 from pathlib import Path
 
 from darswin.data.labels.coco import read_coco, write_coco
-from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Labels, Thing, moved
+from darswin.data.labels.labels import LabelledPictures, Labels, Thing, moved
 from darswin.data.labels.woodscape import BOXES, has_boxes, read_woodscape_boxes
 from darswin.data.labels.yolo import is_yolo, read_yolo, write_yolo
 from darswin.utils.parameters import naming
 from darswin.utils.text import is_json_file
 
 __all__ = [
-    "LEAST_VISIBLE",
     "LabelledPictures",
     "Labels",
     "Thing",
     "moved",
     "open_labels",
-    "read_coco",
     "write_coco",
     "write_yolo",
 ]
@@ -27,7 +25,8 @@ def open_labels(path: str | Path, pictures: str | Path | None = None) -> Labelle
 
     Args:
         path: a COCO file, or a folder in the form of YOLO or of WoodScape with its boxes.
-        pictures: the folder of the pictures of a COCO file, see `read_coco`.
+        pictures: the folder of the pictures of a COCO file, if it is in none of the usual places: the folder of the
+            file, `images/` beside it, or where COCO has it.
 
     Raises:
         FileNotFoundError: another path, or missing files.

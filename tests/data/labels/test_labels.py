@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from darswin.boxes import decode_rle, encode_rle, iou
 from darswin.data import Moved, Sample, Turn, Warped, reframe
-from darswin.data.labels import LEAST_VISIBLE, Labels, Thing, moved
+from darswin.data.labels import Labels, Thing, moved
+from darswin.data.labels.labels import LEAST_VISIBLE
 from darswin.lens import Equidistant, Perspective, Spherical
 
 SIZE = (240, 320)
