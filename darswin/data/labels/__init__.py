@@ -25,8 +25,8 @@ def open_labels(path: str | Path, pictures: str | Path | None = None) -> Labelle
 
     Args:
         path: a COCO file, or a folder in the form of YOLO or of WoodScape with its boxes.
-        pictures: the folder of the pictures of a COCO file, if it is in none of the usual places: the folder of the
-            file, `images/` beside it, or where COCO has it.
+        pictures: the folder of the pictures of a COCO file, if it is not one of the usual places:
+            the folder of the file, `images/` beside it, or where COCO has it.
 
     Raises:
         FileNotFoundError: another path, or missing files.
