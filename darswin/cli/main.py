@@ -64,6 +64,11 @@ COMMANDS = {
         PICTURES,
         "darswin.cli.lens:COMMANDS",
     ),
+    "warp": Command(
+        "writes pictures and labels as another lens or a view sees them",
+        PICTURES,
+        "darswin.cli.warp:warp",
+    ),
     "bench": Command(
         "measures the speed of a model on this machine (15 minutes)",
         (),

@@ -14,6 +14,7 @@ import torch
 
 from darswin import boxes
 from darswin.cli.answers import Answers, file_of, label_png, said, write_overlay
+from darswin.cli.views import named_view
 from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import read_list
 from darswin.deploy.network import Detections, OnnxNetwork
@@ -23,7 +24,7 @@ from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, naming
-from darswin.views import PixelView, PlainView, make_view
+from darswin.views import PlainView
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
@@ -58,7 +59,10 @@ class NetworkAnswers(Answers):
         for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
             given = ",".join(f"{value:g}" for value in values)
             check(name, given, all(map(math.isfinite, values)), "finite")
-        make = partial(_view, view or VIEW, fov_deg, up, mean or (0.0,), std or (1.0,))
+        make = partial(
+            named_view, "view", view or VIEW, fov_deg=fov_deg, up=up, mean=mean or (0.0,),
+            std=std or (1.0,),
+        )  # fmt: skip
         # The network says how large its pictures are, but the view how many there are.
         try:
             self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
@@ -202,33 +206,6 @@ class NetworkAnswers(Answers):
                 answer[output]["labels"] = f"labels/{name}.png"
                 answer[output]["overlay"] = write_overlay(self._out, name, laid)
         return answer
-
-
-def _view(
-    spec: str, fov_deg: float | None, up: Sequence[float] | None, mean: Sequence[float],
-    std: Sequence[float], size: tuple[int, int],
-) -> PixelView:  # fmt: skip
-    """The view NAME[:COUNT] of (H, W)."""
-    name, _, count = spec.partition(":")
-    options: dict[str, Any] = {
-        key: values[0] if len(values) == 1 else values
-        for key, values in (("mean", mean), ("std", std))
-    }
-    if up is not None:
-        options["up"] = up
-    if count:
-        check("view", spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
-        options["count"] = int(count)
-    if fov_deg is not None:
-        check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
-        options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
-    try:
-        view = make_view(name, size, **options)
-    except TypeError as error:
-        raise ValueError(str(error)) from error
-    if not isinstance(view, PixelView):
-        raise ValueError(f"--view {name} shows no picture to a network")
-    return view
 
 
 def _rounded(values: Any, digits: int) -> Any:

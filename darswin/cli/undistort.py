@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from darswin.frames import Sampler
 
 MOST_PIXELS = 2**26  # of a view
-WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 RECORD, LENS = "undistorted.json", "lens.json"
 _KEPT = 8  # plans in memory, for pictures of several sizes or cameras
 
@@ -178,21 +177,15 @@ class _Views:
 
 def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path, Lens | None]:
     """Undistorts a picture; returns its new path and the camera of the view."""
-    import cv2
-
-    from darswin.utils.image import read_header, read_oriented
+    from darswin.utils.image import read_header, read_oriented, write_image, written_as
 
     with warnings.catch_warnings(action="ignore"):  # Pillow's, about what it skips
         channels = read_header(name).channels
     image, orientation = read_oriented(name, channels)
     viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
     picture = viewed.sampler(image)
-    if target.suffix.lower() not in WRITTEN:
-        target = target.with_name(f"{target.name}.png")
-    done, content = cv2.imencode(target.suffix, picture[..., ::-1])
-    if not done:
-        raise OSError(f"OpenCV cannot write {target}")
-    replace_file(target, content.data)
+    target = written_as(target)
+    write_image(target, picture)
     return target, viewed.camera
 
 

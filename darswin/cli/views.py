@@ -2,13 +2,16 @@
 
 import math
 import warnings
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import Lens
-from darswin.utils.parameters import check
+from darswin.lens import BrownConrady, Lens, Perspective
+from darswin.lens.files.load import reach
+from darswin.utils.parameters import check, naming
+from darswin.views import PixelView, make_view
 from darswin.viz.report import sides
 
 View = Literal["perspective", "cylindrical", "equirectangular", "square"]
@@ -72,6 +75,46 @@ def view_rays(
 
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
     return getattr(views, view)(size, fov, yaw=yaw, pitch=pitch)
+
+
+def to_corners(lens: Lens) -> Lens:
+    """A pinhole camera up to the corners of its picture, since it has no image circle; another
+    lens, or a distorted one with a θ_max of its own, as it is."""
+    whole = lens.with_theta_max(None)
+    distorted = isinstance(lens, BrownConrady) and (lens.theta_max - reach(whole)).abs() < 1e-5
+    if lens.image_size is None or not (isinstance(lens, Perspective) or distorted):
+        return lens
+    height, width = (lens.image_size[0] - 0.5).tolist()
+    corners = [[x, y] for x in (-0.5, width) for y in (-0.5, height)]
+    theta = whole.theta_and_direction(lens.theta_max.new_tensor([corners]))[0]
+    return lens.with_theta_max(theta.nan_to_num(whole.theta_max.item()).max().item())
+
+
+def named_view(
+    parameter: str, spec: str, size: tuple[int, int], *, fov_deg: float | None,
+    up: Sequence[float] | None, mean: Sequence[float] = (0.0,), std: Sequence[float] = (1.0,),
+) -> PixelView:  # fmt: skip
+    """The view NAME or NAME:COUNT of (H, W) that a `parameter` names, for networks."""
+    name, _, count = spec.partition(":")
+    options: dict[str, Any] = {
+        key: values[0] if len(values) == 1 else values
+        for key, values in (("mean", mean), ("std", std))
+    }
+    if up is not None:
+        options["up"] = up
+    if count:
+        check(parameter, spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
+        options["count"] = int(count)
+    if fov_deg is not None:
+        check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
+        options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
+    try:
+        view = make_view(name, size, **options)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(view, PixelView):
+        raise naming(ValueError(f"`{parameter}` {name} shows no picture to a network"), parameter)
+    return view
 
 
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:

@@ -1,7 +1,9 @@
 """Views whose pixels look along rays of the camera: maps of the sphere, upright if you know up."""
 
+import copy
 import math
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -83,6 +85,14 @@ class RayView(PixelView):
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
+        self._known: tuple[Tensor, Tensor] | None = None
+
+    def for_lens(self, lens: Lens, size: Pair) -> Self:
+        """The same view of lenses like this one alone: it finds once what it covers of them, which
+        takes most of the time of `to_view`. size: (H, W) of the images."""
+        view = copy.copy(self)
+        view._known = self._layout(lens, size)
+        return view
 
     def to_plane(self, rays: Tensor) -> Tensor:
         """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
@@ -188,6 +198,8 @@ class RayView(PixelView):
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
         1, 2)."""
+        if self._known is not None:
+            return self._known
         lens = lens.detach()
         start = self._start(lens.theta_max)
         if self.fov is not None:

@@ -324,3 +324,14 @@ def test_angles_and_extrinsics_are_one_or_the_other():
             up_of(extrinsics=wrong)
     with pytest.raises(ValueError, match="one lens, got 2"):
         make_view("mercator", (8, 8)).to_image(np.zeros((1, 2)), Equidistant([9.0, 9.0]), SIZE)
+
+
+@every_ray_view
+def test_a_view_for_one_lens_is_the_same_view(name):
+    lens, other = (Equidistant.from_fov(f, 60.0, image_size=(120, 160)).to(f64) for f in (2.5, 1))
+    view = make_view(name, (40, 50))
+    known, points = view.for_lens(lens, (120, 160)), 160 * torch.rand(9, 2, dtype=f64)
+    for one in (lens, other):
+        found = known.to_view(points, one, (120, 160)), view.to_view(points, one, (120, 160))
+        same = torch.equal(*(points.nan_to_num(-1) for points in found))
+        assert same == (one is lens or name == "panorama")  # which is as wide for all
