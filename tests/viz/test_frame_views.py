@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
+from lens_examples import FRONT
 
 from darswin import frames
 from darswin.lens import Equidistant
@@ -58,6 +59,13 @@ def test_views_agree_with_opencv(view):
     expected = undistort(smooth, lens, view)
     assert found.shape == expected.shape == (*view.size, 3)
     assert np.abs(found.astype(int) - expected).max() <= 2  # OpenCV's weights have 5 bits
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_places_are_exact_for_lenses_in_single_precision_too(view):
+    size = (966, 1280)
+    exact = frames.plan(view, FRONT.to(torch.float64), size)
+    assert frames.plan(view, FRONT, size) == exact
 
 
 def test_views_can_become_normalized_images_for_any_network():
