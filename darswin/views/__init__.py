@@ -8,7 +8,7 @@ from darswin.views.base import (
     View,
 )
 from darswin.views.cylindrical import CylindricalView
-from darswin.views.directions import RayView, up_of
+from darswin.views.directions import RayView, turned, up_of
 from darswin.views.equirectangular import EquirectangularView
 from darswin.views.mercator import MercatorView
 from darswin.views.panorama import PanoramaView
@@ -44,5 +44,6 @@ __all__ = [
     "make_view",
     "polar_grid",
     "register_view",
+    "turned",
     "up_of",
 ]

@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +13,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
-from darswin.utils.angles import degrees_hint
+from darswin.utils.angles import check_turn, degrees_hint
 from darswin.views.base import Pair, PerChannel, PixelView, Prepared
 
 Vector = Sequence[float] | Tensor
@@ -351,6 +351,25 @@ def up_of(
         raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
     up = rotation.T @ torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
     return unit_vector("up", up)
+
+
+def turned(yaw: float = 0.0, pitch: float = 0.0) -> dict[str, Any]:
+    """The options `up` and `direction` of a view that looks `yaw` to the right and `pitch` up.
+
+    The view is pitched about the camera's x axis first, and then turned about its y axis. Give the
+    `direction` alone to a view that stays level with another `up`.
+
+    Args:
+        yaw, pitch: in [-2π, 2π] rad.
+    """
+    check_turn("yaw", yaw)
+    check_turn("pitch", pitch)
+    ahead, above = math.cos(pitch), math.sin(pitch)
+    right, forward = math.sin(yaw), math.cos(yaw)
+    return dict(
+        up=(-above * right, -ahead, -above * forward),
+        direction=(ahead * right, -above, ahead * forward),
+    )
 
 
 def _row(values: Tensor, dim: int) -> Tensor:
