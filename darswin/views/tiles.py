@@ -36,7 +36,7 @@ _LAYOUTS = {
     5: (True, 60, 0, 85),
     6: (True, 60, -90, 85),
     7: (True, 60, 0, 80),
-    8: (True, 60, -90, 80),
+    8: (True, 65, -90, 80),
     9: (True, 65, 0, 80),
 }
 _WHOLE = math.radians(165)  # for wider lenses, tiles that look farther aside found no more
