@@ -31,7 +31,7 @@ QUICK = """
 def test_cells_have_folders_of_their_own():
     cells = all_cells(3)
     assert len({cell.key for cell in cells}) == len(cells)
-    assert len(cells) == len(STUDIED) * (len(STUDIED_MODELS) * 3 + len(CONTROLLED)) == 56
+    assert len(cells) == len(STUDIED) * (len(STUDIED_MODELS) * 3 + len(CONTROLLED)) == 104
     assert cells[0].key == "darswin-unet-ra-wide-segmentation-0"
 
 
