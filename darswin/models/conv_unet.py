@@ -11,10 +11,11 @@ from darswin.lens.spacing import Spacing
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
-from darswin.ops.checks import per_channel
+from darswin.ops.checks import per_channel, side_or_pair
 from darswin.utils.tasks import PixelTask
 from darswin.views import Prepared, make_view
-from darswin.views.base import Pair, PerChannel, check_count
+from darswin.views.base import Pair, PerChannel, check_count, check_one_picture
+from darswin.views.directions import Vector
 
 # About as many parameters as "darswin_unet_a" of the same size.
 _SIZES: Presets = dict(
@@ -58,12 +59,13 @@ class ConvUnet(PixelModel):
         view: the name of a view of pixels, one of `list_views()`. "none" takes the images as they
             are.
         size: (H', W') of the view in pixels, or the side of a square; "none" ignores it.
-        max_fov, spacing, theta_max: options of the view; None means the view's own default.
+        max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
+            own default, and views refuse the options of others.
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
             point are not normalized.
 
     Raises:
-        ValueError: a width or another option is wrong.
+        ValueError: a width or another option is wrong, or the view is of several pictures.
 
     Source: Ronneberger et al., MICCAI 2015; with padding, batch norm and bilinear upsampling. The
         rays as channels are those of CAM-Convs, CVPR 2019, in another parametrization.
@@ -85,6 +87,9 @@ class ConvUnet(PixelModel):
         max_fov: float | None = None,
         spacing: Spacing | None = None,
         theta_max: float | None = None,
+        fov: float | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
         mean: PerChannel = 0.0,
         std: PerChannel = 1.0,
     ):
@@ -93,11 +98,12 @@ class ConvUnet(PixelModel):
             raise ValueError(f"widths must be at least 1, for at least one level, got {widths}")
         self.in_chans, self.reads_rays = in_chans, rays
         mean, std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
-        height, width = (size, size) if isinstance(size, int) else size
         self.view = make_view(
-            view, None if view == "none" else (height, width), mean=mean, std=std,
-            max_fov=max_fov, spacing=spacing, theta_max=theta_max,
+            view, None if view == "none" else side_or_pair("size", size), mean=mean, std=std,
+            max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov, up=up,
+            direction=direction,
         )  # fmt: skip
+        check_one_picture(self.view)
         self.goes_back = self.view.uses_lens
         self.feature_info = FeatureInfo(
             dict(num_chs=width, reduction=2**level, module=f"down.{level}", map_size=None)

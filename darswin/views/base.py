@@ -340,6 +340,15 @@ def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
     return seen
 
 
+def check_one_picture(view: View) -> None:
+    """ValueError for a view that shows several pictures of each image."""
+    if view.count != 1:
+        raise ValueError(
+            f"this model takes one picture of each image, but the view shows {view.count}: put a "
+            "network behind them with LensAdapter"
+        )
+
+
 def check_lens(lens: Lens | None, size: Pair) -> Lens:
     """Returns the lens if it is one for images of (H, W); its size is checked if `readable`."""
     if not isinstance(lens, Lens):
