@@ -217,6 +217,10 @@ class PixelView(View):
         """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
         raise NotImplementedError
 
+    def reads_of(self, size: Pair) -> int:
+        """The points along each side of a pixel at which images of (H, W) are read."""
+        return 1
+
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN
         where the view shows nothing. size: (H, W) of the images of N lenses."""

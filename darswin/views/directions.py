@@ -123,7 +123,7 @@ class RayView(PixelView):
     def read_points(self, lens: Lens, size: Pair) -> Tensor:
         """`image_points` of a view that may see nothing of the lens: for each pixel, the points at
         which it reads the image, (N, k·H', k·W', 2)."""
-        return as_map(self.place(lens, self._rays(lens, size, self._reads(size)), size))
+        return as_map(self.place(lens, self._rays(lens, size, self.reads_of(size)), size))
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
         grid = pixel_grid(size, lens.theta_max)
@@ -141,7 +141,7 @@ class RayView(PixelView):
         return torch.where(shown, theta, torch.nan), rays[..., :2] / aside[..., None]
 
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
-        reads = self._reads(prepared.size)
+        reads = self.reads_of(prepared.size)
         seen = super().see(images, prepared, dtype)
         return seen if reads == 1 else F.avg_pool2d(seen, reads)
 
@@ -168,7 +168,7 @@ class RayView(PixelView):
         least = -1.0 if self.theta_max is None else math.cos(self.theta_max)
         return rays[..., 2] >= least - 1e-6
 
-    def _reads(self, size: Pair) -> int:
+    def reads_of(self, size: Pair) -> int:
         # It must not depend on the values of a lens, which a compiled graph does not have.
         if self.reads is not None:
             return self.reads

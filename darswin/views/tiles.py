@@ -128,6 +128,9 @@ class TilesView(PixelView):
         theta, direction = zip(*(tile.pixel_rays(lens, size) for tile in self.tiles), strict=True)
         return torch.cat(theta, 1), torch.cat(direction, 1)
 
+    def reads_of(self, size: Pair) -> int:
+        return self.tiles[0].reads_of(size)
+
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
         seen = self.tiles[0].see(images, prepared, dtype)
         return seen.unflatten(2, (self.count, -1)).transpose(1, 2).flatten(0, 1)
