@@ -9,7 +9,7 @@ from jobs import key_of
 # Training shows every picture as a lens of any ξ would have seen it.
 THROUGH_ANY = ("--data.lens_augmentation", "0..1")
 
-# The same view for all lenses: 4.2 rad (241°) wide, so that it shows the whole picture of all lenses
+# The same view for all lenses: 4.2 rad (241°) wide, so that it shows all of the pictures of lenses
 # of 165°. It has as many pixels as the picture, to 2 %. Windows divide the maps of all stages.
 MERCATOR = dict(view="mercator", fov=4.2, size=[144, 112])
 EQUIRECTANGULAR = dict(view="equirectangular", fov=4.2, size=[112, 144])
