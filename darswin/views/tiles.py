@@ -32,12 +32,12 @@ from darswin.views.stereographic import StereographicView
 # For each count: whether a tile is in the middle; and in degrees, for fields of view from 165°, the
 # angle of the others from the middle, their first azimuth, and the field of view of a tile.
 _LAYOUTS = {
-    4: (False, 48, 45, 115),
-    5: (True, 65, 0, 100),
-    6: (False, 52, 30, 90),
-    7: (True, 65, 0, 90),
-    8: (True, 65, 90, 85),
-    9: (True, 65, 0, 80),
+    4: (False, 50, 0, 100),
+    5: (True, 60, 0, 100),
+    6: (True, 60, -90, 90),
+    7: (True, 60, -90, 85),
+    8: (True, 60, -90, 80),
+    9: (True, 60, 0, 80),
 }
 _WHOLE = math.radians(165)  # for wider lenses, tiles that look farther aside found no more
 
