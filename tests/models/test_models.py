@@ -218,7 +218,7 @@ def test_the_dtype_of_pixels_that_were_sampled_already(case):
             assert_close(found, model.run(images, prepared), 0.1)
     if model.view.in_pixels:  # such as a camera's undistorted frames
         frames = torch.randint(256, sampled.shape, dtype=torch.uint8)
-        expected = model.run_sampled(model.normalize(frames), prepared)
+        expected = model.run_sampled(model.view.normalized(frames, torch.float32), prepared)
         assert_equal(model.run_sampled(frames, prepared), expected)
 
 
