@@ -142,8 +142,10 @@ def main(arguments: list[str] | None = None) -> None:
             blind, oracle = record["trivial"], record["bounds"]
         else:
             blind, oracle = trivial(args.out), bounds(args.out)
-        record = collect(results, blind, oracle, CONFIG.read_text(), args.size)
-        publish(record, args.out, args.results)
+        made = collect(results, blind, oracle, CONFIG.read_text(), args.size)
+        if record and args.collect:  # nothing was run here
+            made["machine"] = record["machine"]
+        publish(made, args.out, args.results)
 
 
 if __name__ == "__main__":

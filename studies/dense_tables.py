@@ -48,12 +48,12 @@ def collect(cells: list[dict], trivial: dict, bounds: dict, config: str, size: s
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
-    """Writes a record, with the machine and versions, and draws its figures.
+    """Writes a record, with the machine and versions if it has none, and draws its figures.
 
     Args:
         out: the folder of the cells; existing predictions in it are drawn.
     """
-    write(folder / "dense.json", machine=machine(), **record)
+    write(folder / "dense.json", **(dict(machine=machine()) | record))
     draw_curves(record["cells"], record["trivial"], folder / "dense.png")
     for task in TASKS:
         keys = {label: Cell(label, "low", task).key for label in MODELS}

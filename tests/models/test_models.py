@@ -39,10 +39,10 @@ CASES = {name: (name, {}) for name in NANOS} | {
     "official": ("official", {}),
     "feature maps": ("darswin_ra_nano", dict(features_only=True, out_indices=(0, 2))),
     "square view": ("swin_nano", dict(view="square", spacing="g")),
-    "conv_unet_nano mercator": ("conv_unet_nano", dict(view="mercator", size=(36, 28), fov=2.6)),
+    "conv_unet_nano mercator": ("conv_unet_nano", dict(view="mercator", size=[36, 28], fov=2.6)),
     "swin_unet_nano equirectangular distance": (
         "swin_unet_nano",
-        dict(task="distance", view="equirectangular", size=(64, 96), window=(4, 6), fov=2.6),
+        dict(task="distance", view="equirectangular", size=[64, 96], window=[4, 6], fov=2.6),
     ),
 }  # fmt: skip
 cases = pytest.mark.parametrize("case", CASES)
