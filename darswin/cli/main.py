@@ -44,7 +44,7 @@ COMMANDS = {
     "validate": Command("evaluates a trained model on the validation set", TRAIN, RUN),
     "test": Command("evaluates a trained model on the test set, for each lens", TRAIN, RUN),
     "predict": Command(
-        "predicts classes, or a class or a distance for every pixel",
+        "predicts classes, or a class or a distance for every pixel; or runs any ONNX network",
         PICTURES,
         "darswin.cli.predict:predict",
     ),

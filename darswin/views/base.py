@@ -308,10 +308,11 @@ def _exactly(points: Points, lens: Lens, move: Callable[[Tensor, Lens], Tensor])
     """Moves points (..., 2) through one lens in float64."""
     if len(lens) != 1:
         raise ValueError(f"points move through one lens, got {len(lens)}")
-    if isinstance(points, np.ndarray):
-        exact = torch.from_numpy(points.astype(np.float64))
+    if not isinstance(points, Tensor):
+        places = np.asarray(points)
+        exact = torch.from_numpy(places.astype(np.float64))
         moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
-        return moved.numpy().astype(np.result_type(points, np.float32), copy=False)
+        return moved.numpy().astype(np.result_type(places, np.float32), copy=False)
     moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]
     return moved.to(torch.promote_types(points.dtype, torch.float32))
 

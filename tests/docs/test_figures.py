@@ -30,6 +30,7 @@ import lens  # noqa: E402
 import levels  # noqa: E402
 import sizes_tables  # noqa: E402
 import tables  # noqa: E402
+import views  # noqa: E402
 
 SHOWN = sorted(
     {
@@ -78,6 +79,7 @@ RETURNED: dict[str, Callable[[], Figure]] = {
     "levels": levels.draw_levels,
     "metres": lambda: draw_predictions([(PICTURE, METRES, METRES)]),
     "polar": lambda: lens.draw_polar_image(PICTURE, WIDE),
+    "views": views.draw_views,
 }
 WRITTEN: dict[str, Callable[[Path], None]] = {
     "dense curves": draw_dense_curves,

@@ -101,7 +101,7 @@ def test_boxes_of_every_view_come_back_to_the_things_in_the_picture(name, lens):
 def test_every_form_of_detections_gives_the_same():
     lens, (images, _) = LENSES["radial"], disks(LENSES["radial"])
     images = torch.cat((images, images.flip(3)))
-    view = make_view("tiles", (256, 256), count=4)
+    view = make_view("tiles", (256, 256))
     as_list = LensAdapter(Disks("list"), view=view)(images, lens)
     by_function = LensAdapter(Disks("dict"), view=view, boxes=lambda out: out["found"])
     assert [len(found["boxes"]) for found in as_list] == [4, 4]
