@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from darswin.utils.parameters import check
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -79,8 +81,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
     """The corners (P, 2) of a polygon, and points between them at most `step` px apart, (Q, 2)."""
     if polygon.ndim != 2 or polygon.shape[1] != 2:
         raise ValueError(f"a polygon must have shape (P, 2), got {_shape(polygon)}")
-    if not step > 0:
-        raise ValueError(f"`step` must be above 0 px, got {step}")
+    check("step", step, step > 0, "above 0 px")
     sides = np.roll(polygon, -1, 0) - polygon
     lengths = np.nan_to_num(np.hypot(*sides.T), posinf=0)  # a side to nowhere stays as it is
     pieces = np.maximum(np.ceil(lengths / step), 1).astype(int)
@@ -145,8 +146,7 @@ def merge(
         ValueError: other shapes, or a limit that is not in [0, 1].
     """
     for name, limit in (("iou", iou), ("inside", inside)):
-        if not 0 <= limit <= 1:
-            raise ValueError(f"`{name}` must be in [0, 1], got {limit}")
+        check(name, limit, 0 <= limit <= 1, "in [0, 1]")
     table, score, label = _table(boxes), _floats(scores), np.asarray(_numpy(labels))
     for name, given in (("scores", score), ("labels", label)):
         if given.shape != (len(table),):

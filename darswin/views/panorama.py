@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.views.base import Pair, PerChannel, register_view
+from darswin.views.base import Pair, PerChannel
 from darswin.views.directions import Vector
 from darswin.views.mercator import MercatorView
+from darswin.views.registry import register_view
 
 
 @register_view("panorama")

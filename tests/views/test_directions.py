@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from darswin.lens import Equidistant, KannalaBrandt, Perspective
 from darswin.lens.base import MODELS
 from darswin.views import RayView, TilesView, list_views, make_view, up_of
-from darswin.views.base import _VIEWS
+from darswin.views.registry import _VIEWS
 
 SIZE = (480, 640)
 WIDE = KannalaBrandt(140.0, [0.01], math.radians(95), center=[322.0, 238.0])

@@ -18,7 +18,7 @@ from darswin.views import (
     make_view,
     register_view,
 )
-from darswin.views.base import _VIEWS
+from darswin.views.registry import _VIEWS
 
 LENSES = {
     "two": Spherical.from_fov([0.2, 0.9], 2.6, 24.0),
