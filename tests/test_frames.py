@@ -121,6 +121,8 @@ SAMPLING = [
     *((family, dict(features_only=True)) for family in ENCODERS if family not in AS_THEY_ARE),
     ("darswin_unet_a", dict(task="distance")),
     ("swin_unet_undis", dict(task="distance")),
+    ("conv_unet", dict(view="mercator", size=(40, 30))),
+    ("swin_unet", dict(view="equirectangular", fov=2.8)),
 ]
 
 

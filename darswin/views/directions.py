@@ -119,8 +119,12 @@ class RayView(PixelView):
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
         of its size: the inverse of `to_rays`. NaN where the view shows nothing."""
+        rays = F.normalize(rays, dim=-1)
+        return self._points(rays, self._shows(rays), lens, size)
+
+    def _points(self, rays: Tensor, shown: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """`to_points` of unit vectors; NaN unless they are shown."""
         step, middle = self._layout(lens, size)
-        shown = self._shows(rays := F.normalize(rays, dim=-1))
         # NaN must not reach the gradients.
         rays = torch.where(shown[..., None], rays, tensor_there(self.direction, rays))
         flat = self.to_plane(rays @ self._turn(rays))
@@ -138,10 +142,7 @@ class RayView(PixelView):
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
         grid = pixel_grid(size, lens.theta_max)
         rays = lens.unproject_points(grid, size)
-        seen = ~rays.isnan().any(-1, keepdim=True)
-        rays = torch.where(seen, rays, tensor_there(self.direction, rays))
-        points = self.to_points(rays, lens, size)
-        return as_map(torch.where(seen, points, torch.nan))
+        return as_map(self._points(rays, self._shows(rays), lens, size))
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         rays = self._rays(lens, size)

@@ -30,13 +30,13 @@ def list_views() -> list[str]:
 
 def make_view(
     name: str,
-    size: Pair,
+    size: Pair | None,
     *,
     mean: PerChannel | None = 0.0,
     std: PerChannel | None = 1.0,
     **options: Any,
 ) -> View:
-    """The view with this name, of (H', W').
+    """The view with this name, of (H', W'); "none" also takes None, for images of any size.
 
     Args:
         mean, std: the arguments of `View`.
