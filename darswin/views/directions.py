@@ -315,6 +315,8 @@ def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> 
         if torch.linalg.cross(ahead_of_level, above).norm() < 1e-6:
             ahead_of_level = torch.tensor(AXIS, dtype=torch.float64)
         right = torch.linalg.cross(ahead_of_level, above)
+    axis = above if upright else ahead
+    right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
     right = right / right.norm()
     down = -above if upright else torch.linalg.cross(ahead, right)
     forward = torch.linalg.cross(right, down) if upright else ahead
