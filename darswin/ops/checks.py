@@ -94,7 +94,7 @@ def as_int(value: Any) -> int | None:
         return None
 
 
-def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
+def check_pair(name: str, value: Any, lowest: int) -> tuple[int, int]:
     """The pair, checked: raises TypeError or ValueError unless it is two ints ≥ `lowest`."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
