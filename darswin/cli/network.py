@@ -59,6 +59,7 @@ class NetworkAnswers(Answers):
         for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
             given = ",".join(f"{value:g}" for value in values)
             check(name, given, all(map(math.isfinite, values)), "finite")
+        check("size", size, size is None or min(size) >= 1, "at least 1,1")
         for value in mean or ():
             check("mean", f"{value:g}", abs(value) <= 1, "in parts of 255, at most 1")
         make = partial(

@@ -363,6 +363,7 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --mean inf", "--mean must be finite, got inf"),
         ("--network n.onnx --size 64,64", "--size must be 256,256 for n.onnx, got 64,64"),
         ("--network free.onnx", "missing --size: free.onnx takes pictures of any size"),
+        ("--network free.onnx --size 0,64", r"--size must be at least 1,1, got \(0, 64\)"),
         (
             "--network bytes.onnx --std 2",
             "bytes.onnx takes pixels of uint8: leave --mean and --std",
