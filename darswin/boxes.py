@@ -268,9 +268,12 @@ def decode_rle(rle: Mapping[str, Any]) -> np.ndarray:
     """The mask (H, W), bool, of COCO's run-length encoding, compressed or not.
 
     Raises:
-        ValueError: runs that do not fill the mask.
+        ValueError: size or counts are missing, or runs do not fill the mask.
     """
-    (height, width), counts = rle["size"], rle["counts"]
+    try:
+        (height, width), counts = rle["size"], rle["counts"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError("a run-length encoding must have a size [H, W] and counts") from error
     if isinstance(counts, bytes):
         counts = counts.decode("ascii")
     runs = np.asarray(_from_text(counts) if isinstance(counts, str) else counts, np.int64)

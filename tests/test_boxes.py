@@ -498,3 +498,9 @@ def test_boxes_need_numpy_alone():
 
 def test_the_package_has_boxes():
     assert darswin.boxes is boxes
+
+
+@pytest.mark.parametrize("rle", [{"size": [2, 2]}, {"counts": [4]}, {"size": None, "counts": [4]}])
+def test_an_encoding_has_a_size_and_counts(rle):
+    with pytest.raises(ValueError, match=r"must have a size \[H, W\] and counts"):
+        boxes.decode_rle(rle)

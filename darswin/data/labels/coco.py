@@ -195,7 +195,7 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
         rle = segments
         try:
             mask = decode_rle(rle)
-        except (KeyError, TypeError, ValueError) as error:
+        except (TypeError, ValueError) as error:
             raise ValueError(f"has a mask that cannot be read: {error}") from error
         if mask.shape != size:
             raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")

@@ -128,7 +128,7 @@ def test_the_share_that_is_visible_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (dict(segmentation={"size": list(SIZE)}), "has a mask that cannot be read: 'counts'"),
+        (dict(segmentation={"size": list(SIZE)}), "has a mask that cannot be read: a run"),
         (dict(segmentation={"size": None, "counts": [1]}), "has a mask that cannot be read"),
         (
             dict(segmentation={"size": list(SIZE), "counts": "zzz"}),
