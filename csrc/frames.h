@@ -6,7 +6,8 @@
 
 namespace darswin {
 
-// The memory of the samples: (points, C) or (C, points) float32, or (points, C) uint8.
+// The memory of the samples: (pixels, C) or (C, pixels) float32, or (pixels, C) uint8. If the
+// output has several pictures, they follow each other.
 enum class FrameOutput { tokens, planes, bytes };
 
 struct ByteImage {
@@ -30,6 +31,8 @@ struct FrameArgs {
   const int16_t *columns, *rows;
   const float *right, *lower;  // distances from that pixel, 0 to 1
   int64_t points;
+  int64_t reads;   // points of a pixel of the output, one after the other: it is their mean
+  int64_t pixels;  // of one picture of the output
   const BorderPoint* border;
   int64_t border_points;
   FrameOutput output;
@@ -43,7 +46,7 @@ struct FrameKernels {
   // `padded` numbers, a multiple of 8 and at least 8 more than the azimuths.
   void (*places)(PolarSampleArgs<float> args, double* angles, int64_t padded, int16_t* columns,
                  int16_t* rows, float* right, float* lower);
-  // Samples points [begin, end) on one thread.
+  // Samples points [begin, end), of whole pixels, on one thread.
   void (*sample)(const FrameArgs& args, int64_t begin, int64_t end);
 };
 

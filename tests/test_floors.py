@@ -21,7 +21,7 @@ FLOORS = (
     ("views",),
     ("data",),
     ("lens",),
-    ("ops", "utils"),
+    ("boxes", "ops", "utils"),
 )
 MOST_LINES = 400
 

@@ -501,7 +501,7 @@ def test_files_of_other_kinds_are_refused(tmp_path):
     np.savez(path, other=1)
     with pytest.raises(ValueError, match="is no plan"):
         frames.Sampler(path)
-    np.savez(path, darswin_plan=3, something=1)
+    np.savez(path, darswin_plan=4, something=1)
     with pytest.raises(ValueError, match="newer version of darswin"):
         frames.Sampler(path)
     np.savez(path, darswin_plan=1, size=(1, 2))

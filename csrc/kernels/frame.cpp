@@ -19,7 +19,25 @@ inline uint8_t to_byte(float sample) {
   return static_cast<uint8_t>(sample < 255 ? sample + 0.5f : 255.0f);
 }
 
-// Writes the samples of a block to the output.
+// The place of channel c of a pixel among planes.
+inline int64_t in_planes(const FrameArgs& a, int64_t pixel, int64_t c) {
+  const int64_t picture = pixel / a.pixels;
+  return (picture * a.image.channels + c) * a.pixels + pixel - picture * a.pixels;
+}
+
+// Replaces the samples of a block by the mean of each pixel's.
+void average(const FrameArgs& a, int64_t count, ByteBlock& block) {
+  const float share = 1.0f / static_cast<float>(a.reads);
+  for (int64_t c = 0; c < a.image.channels; ++c) {
+    for (int64_t k = 0; k < count; ++k) {
+      float sum = 0;
+      for (int64_t r = 0; r < a.reads; ++r) sum += block.samples[c][k * a.reads + r];
+      block.samples[c][k] = sum * share;
+    }
+  }
+}
+
+// Writes the pixels of a block, which are in one picture, to the output.
 void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlock& block) {
   const int64_t channels = a.image.channels;
   if (a.output == FrameOutput::tokens) {
@@ -27,7 +45,7 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlo
   }
   if (a.output == FrameOutput::planes) {
     for (int64_t c = 0; c < channels; ++c) {
-      copy(block.samples[c], count, static_cast<float*>(a.out) + c * a.points + first);
+      copy(block.samples[c], count, static_cast<float*>(a.out) + in_planes(a, first, c));
     }
     return;
   }
@@ -44,12 +62,18 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlo
   }
 }
 
-void write_border(const FrameArgs& a, const BorderPoint& point) {
-  const int64_t channels = a.image.channels, k = point.index;
+// Writes the pixel whose points begin at this one of `border`.
+void write_border(const FrameArgs& a, const BorderPoint* points) {
+  const int64_t channels = a.image.channels, k = points->index / a.reads;
   for (int64_t c = 0; c < channels; ++c) {
-    const float v = border_sample(a.image, point.column, point.row, point.right, point.lower, c);
+    float v = 0;
+    for (int64_t r = 0; r < a.reads; ++r) {
+      const BorderPoint& p = points[r];
+      v += border_sample(a.image, p.column, p.row, p.right, p.lower, c);
+    }
+    v *= 1.0f / static_cast<float>(a.reads);
     if (a.output == FrameOutput::planes) {
-      static_cast<float*>(a.out)[c * a.points + k] = v;
+      static_cast<float*>(a.out)[in_planes(a, k, c)] = v;
     } else if (a.output == FrameOutput::tokens) {
       static_cast<float*>(a.out)[k * channels + c] = v;
     } else {
@@ -62,19 +86,22 @@ void sample(const FrameArgs& a, int64_t begin, int64_t end) {
   alignas(64) ByteBlock block;
   // A frame of one row or column has no four neighbours: all its points are border points.
   const bool neighbours = a.image.height > 1 && a.image.width > 1;
-  for (int64_t k = begin; k < end && neighbours; k += kByteBlock) {
-    const int64_t count = smaller(kByteBlock, end - k);
-    find_offsets(a, k, count, block.offset);
-    block.sample(a.image, a.right + k, a.lower + k, count);
-    write_block(a, k, count, block);
+  const int64_t most = kByteBlock / a.reads, last = end / a.reads;
+  for (int64_t pixel = begin / a.reads, count; pixel < last && neighbours; pixel += count) {
+    count = smaller(smaller(most, last - pixel), a.pixels - pixel % a.pixels);
+    const int64_t first = pixel * a.reads;
+    find_offsets(a, first, count * a.reads, block.offset);
+    block.sample(a.image, a.right + first, a.lower + first, count * a.reads);
+    if (a.reads > 1) average(a, count, block);
+    write_block(a, pixel, count, block);
   }
   int64_t low = 0, high = a.border_points;  // finds the first border point from `begin` on
   while (low < high) {
     const int64_t middle = (low + high) / 2;
     a.border[middle].index < begin ? low = middle + 1 : high = middle;
   }
-  for (; low < a.border_points && a.border[low].index < end; ++low) {
-    write_border(a, a.border[low]);
+  for (; low < a.border_points && a.border[low].index < end; low += a.reads) {
+    write_border(a, a.border + low);
   }
 }
 

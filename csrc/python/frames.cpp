@@ -27,6 +27,8 @@ namespace py = pybind11;
 namespace darswin {
 namespace {
 
+constexpr int64_t kMostReads = 16;  // along a side of a pixel: all points fit one block
+
 template <typename T>
 using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
 using Shape = std::vector<py::ssize_t>;
@@ -63,8 +65,9 @@ class Sampler {
  public:
   Sampler(const Array<int16_t>& columns, const Array<int16_t>& rows, const Array<float>& right,
           const Array<float>& lower, std::pair<int64_t, int64_t> size, std::vector<float> scale,
-          std::vector<float> offset, const std::string& output)
-      : shape(columns.shape(), columns.shape() + columns.ndim()),
+          std::vector<float> offset, const std::string& output, int64_t reads)
+      : reads(reads * reads),
+        shape(columns.shape(), columns.shape() + columns.ndim() - (reads > 1)),
         columns(padded(columns)),
         rows(padded(rows)),
         right(padded(right)),
@@ -78,9 +81,11 @@ class Sampler {
                known = tokens || output == "image" || output == "uint8";
     const bool sizes = height > 0 && width > 0 && height <= INT16_MAX && width <= INT16_MAX;
     const bool channels = this->scale.size() == 1 || this->scale.size() == 3;
-    if (!known || !sizes || !channels || this->scale.size() != this->offset.size() ||
-        shape.size() != (tokens ? 4 : 2) || rows.size() != points || right.size() != points ||
-        lower.size() != points) {
+    const bool axes =
+        tokens ? shape.size() == 4 && reads == 1 : shape.size() == 2 || shape.size() == 3;
+    if (!known || !sizes || !channels || this->scale.size() != this->offset.size() || reads < 1 ||
+        reads > kMostReads || !axes || (reads > 1 && columns.shape(shape.size()) != this->reads) ||
+        rows.size() != points || right.size() != points || lower.size() != points) {
       throw py::value_error("the parts of the plan do not fit together");
     }
     kind = tokens              ? FrameOutput::tokens
@@ -91,10 +96,18 @@ class Sampler {
       if (!(x >= 0 && x <= 1 && y >= 0 && y <= 1)) {
         throw py::value_error("the plan has distances outside of [0, 1]");
       }
-      int16_t &column = this->columns[k], &row = this->rows[k];
-      if (column >= 0 && row >= 0 && column < width - 1 && row < height - 1) continue;
-      border.push_back({k, column, row, x, y});
-      column = row = 0;
+    }
+    for (int64_t first = 0; first < points; first += this->reads) {
+      bool inside = true;
+      for (int64_t k = first; k < first + this->reads; ++k) {
+        inside &= this->columns[k] >= 0 && this->rows[k] >= 0 && this->columns[k] < width - 1 &&
+                  this->rows[k] < height - 1;
+      }
+      for (int64_t k = first; k < first + this->reads && !inside; ++k) {
+        int16_t &column = this->columns[k], &row = this->rows[k];
+        border.push_back({k, column, row, this->right[k], this->lower[k]});
+        column = row = 0;
+      }
     }
   }
 
@@ -143,6 +156,8 @@ class Sampler {
     a.columns = columns.data(), a.rows = rows.data();
     a.right = right.data(), a.lower = lower.data();
     a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
+    const int64_t pictures = kind != FrameOutput::tokens && shape.size() == 3 ? shape[0] : 1;
+    a.reads = reads, a.pixels = a.points / reads / std::max<int64_t>(pictures, 1);
     a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
     a.output = kind;
     py::array result = output_array(out, output_shape(image.channels, colors));
@@ -162,8 +177,10 @@ class Sampler {
     if (kind == FrameOutput::tokens) {
       return {shape[0], shape[1], shape[2] * shape[3] * channels};
     }
-    if (kind == FrameOutput::planes) return {channels, shape[0], shape[1]};
-    return colors ? Shape{shape[0], shape[1], channels} : shape;
+    Shape sizes = shape;
+    if (kind == FrameOutput::planes) sizes.insert(sizes.end() - 2, channels);
+    if (kind == FrameOutput::bytes && colors) sizes.push_back(channels);
+    return sizes;
   }
 
   py::array output_array(const py::object& given, const Shape& sizes) const {
@@ -191,14 +208,15 @@ class Sampler {
     constexpr int64_t kLeast = 10'000;
     const auto& kernel = kernels<FrameKernels>();
     threads = std::clamp<int64_t>(a.points / kLeast, 1, threads);
+    const auto end = [&](int64_t t) { return a.points / a.reads * t / threads * a.reads; };
     std::vector<std::jthread> others;
     for (int64_t t = 1; t < threads; ++t) {
-      others.emplace_back(kernel.sample, std::cref(a), a.points * t / threads,
-                          a.points * (t + 1) / threads);
+      others.emplace_back(kernel.sample, std::cref(a), end(t), end(t + 1));
     }
-    kernel.sample(a, 0, a.points / threads);
+    kernel.sample(a, 0, end(1));
   }
 
+  const int64_t reads;
   const Shape shape;
   std::vector<int16_t> columns, rows;
   const std::vector<float> right, lower;
@@ -244,9 +262,9 @@ PYBIND11_MODULE(_frames, m) {
   m.def("sampler", [](const Array<int16_t>& columns, const Array<int16_t>& rows,
                       const Array<float>& right, const Array<float>& lower,
                       std::pair<int64_t, int64_t> size, std::vector<float> scale,
-                      std::vector<float> offset, const std::string& output) {
+                      std::vector<float> offset, const std::string& output, int64_t reads) {
     const auto sampler = std::make_shared<const Sampler>(
-        columns, rows, right, lower, size, std::move(scale), std::move(offset), output);
+        columns, rows, right, lower, size, std::move(scale), std::move(offset), output, reads);
     return py::cpp_function([sampler](const py::object& frame, const py::object& out,
                                       int64_t threads) { return (*sampler)(frame, out, threads); },
                             py::name("sample"), py::arg("frame"), py::arg("out") = py::none(),

@@ -15,7 +15,8 @@ import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from darswin.utils.files import replace_file
+from darswin.utils.tables import read_table
 
 try:
     from darswin.frames import _frames
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "Sampler", "plan"]
 
 Output = Literal["tokens", "image", "uint8"]
-_VERSION = 2
+_VERSION = 3
 _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
 
@@ -55,14 +57,16 @@ class Plan:
 
     Attributes:
         columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
-            lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, and (H', W') for
-            an image; a polar image has H' = R·S_r and W' = A·S_φ.
+            lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, (H', W') for an
+            image, and (n, H', W') for n tiles; a polar image has H' = R·S_r and W' = A·S_φ. If
+            `reads` is above 1, there is a last axis of `reads`² points, row by row.
         right, lower: the distances of each point from the centre of that pixel, in [0, 1], float32.
         size: (H, W) of the frames.
-        output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W'), and "uint8"
-            is (H', W', C), as OpenCV has it.
+        output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W') or (n, C, H',
+            W'), and "uint8" is (H', W', C) or (n, H', W', C), as OpenCV has it.
         mean, std: normalization `(pixel/255 - mean) / std`, one number for each channel, or one for
             all; "uint8" is not normalized.
+        reads: the points along each side of a pixel, which is their mean. An image only.
 
     Raises:
         ValueError: mean and std are not 1 or 3 finite numbers each, or a std is not above 0.
@@ -76,6 +80,7 @@ class Plan:
     output: Output
     mean: tuple[float, ...] = (0.0,)
     std: tuple[float, ...] = (1.0,)
+    reads: int = 1
 
     def __post_init__(self) -> None:
         for name, least in (("mean", -math.inf), ("std", 0.0)):
@@ -92,12 +97,42 @@ class Plan:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
             return NotImplemented
-        return all(
-            np.array_equal(value, getattr(other, name)) for name, value in vars(self).items()
-        )
+        parts = other._parts()
+        return all(np.array_equal(value, parts[name]) for name, value in self._parts().items())
+
+    def _parts(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __hash__(self) -> int:
         return hash((self.size, self.output, self.mean, self.std, self.columns.shape))
+
+    def points(self, points: np.ndarray, tile: int = 0) -> np.ndarray:
+        """Carries pixels of the image to pixels of the frame, as a map for `darswin.boxes`.
+
+        Args:
+            points: (..., 2), x and y; pixel centres are integers.
+            tile: the number of the tile, if the plan has tiles.
+
+        Returns:
+            (..., 2) float64, NaN where nothing is seen. It differs from the lens by a few
+            thousandths of a pixel, as places between pixels are read bilinearly.
+
+        Raises:
+            ValueError: the plan has tokens, which have no pixels.
+            IndexError: there is no such tile.
+        """
+        return read_table(self._tables[tile], (np.asarray(points) + 0.5) * self.reads - 0.5)
+
+    @cached_property
+    def _tables(self) -> np.ndarray:
+        """The places of the points, (n, reads·H', reads·W', 2), NaN outside of the frame."""
+        if self.output == "tokens":
+            raise ValueError("a plan of tokens has no pixels that could be carried to the frame")
+        places = np.stack((self.columns + self.right, self.rows + self.lower), -1, dtype=float)
+        places[self.columns == _OUTSIDE] = np.nan
+        height, width = self.columns.shape[-2 - (self.reads > 1) :][:2]
+        places = places.reshape(-1, height, width, self.reads, self.reads, 2)
+        return places.swapaxes(2, 3).reshape(-1, height * self.reads, width * self.reads, 2)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
@@ -108,7 +143,7 @@ class Plan:
         """
         if Path(path).suffix != ".npz":
             raise ValueError(f"the name of a plan's file must end in .npz, got {os.fspath(path)!r}")
-        buffer, content = BytesIO(), dict(vars(self), darswin_plan=_VERSION)
+        buffer, content = BytesIO(), dict(self._parts(), darswin_plan=_VERSION)
         np.savez(buffer, **content, digest=_digest(content))
         replace_file(path, buffer.getbuffer())
 
@@ -116,8 +151,8 @@ class Plan:
     def load(cls, path: str | os.PathLike) -> "Plan":
         """Reads a plan from a file.
 
-        Files of version 1 are read too. Some of them normalize before they interpolate; the samples
-        of such a plan now differ from those of its time by rounding.
+        Files of versions 1 and 2 are read too. Some of version 1 normalize before they interpolate;
+        the samples of such a plan now differ from those of its time by rounding.
 
         Raises:
             ValueError: the file is no plan, is damaged, or comes from a newer version of darswin.
@@ -149,6 +184,7 @@ class Plan:
                 output=content["output"].item(),
                 mean=tuple(content["mean"].tolist()),
                 std=tuple(content["std"].tolist()),
+                reads=content["reads"].item() if version > 2 else 1,
             )
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
@@ -192,7 +228,7 @@ class Sampler:
                 plan.columns, plan.rows, plan.right, plan.lower, plan.size,
                 [1 / (255 * std) for std in plan.std],
                 [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
-                plan.output,
+                plan.output, plan.reads,
             )  # fmt: skip
         except TypeError as error:
             raise ValueError("the parts of the plan do not fit together") from error
@@ -217,7 +253,8 @@ def plan(
 
     Args:
         sample: a model, which reads a polar grid or a view of its own; a `PolarSample` layer; or
-            the rays (H', W', 3) of a view, see `darswin.viz.views`.
+            the rays (H', W', 3) of a view, see `darswin.viz.views`. All tiles of a view are in one
+            plan.
         lens: the lens of the camera.
         size: (H, W) of the frames.
         output: the form of the result, see `Plan`. By default it is the input of the model's or the
@@ -252,7 +289,8 @@ def plan(
         )
     channels = found.channels or max(np.size(mean), np.size(std))
     if found.samples is None:
-        arrays = _at_pixels(found.points.double().numpy(), size, output)
+        points = found.points.double().numpy()
+        arrays = _at_pixels(points, size, output, found.tiles, found.reads)
     else:
         arrays = _on_grid(found.points, found.samples, size, output)
     return Plan(
@@ -261,6 +299,7 @@ def plan(
         output=output,
         mean=per_channel("mean", mean, channels),
         std=per_channel("std", std, channels),
+        reads=found.reads,
     )
 
 
@@ -284,13 +323,22 @@ def _on_grid(
     return dict(zip(("columns", "rows", "right", "lower"), arrays, strict=True))
 
 
-def _at_pixels(points: np.ndarray, size: tuple[int, int], output: Output) -> dict[str, Any]:
-    """The places of single points (H', W', 2), x and y in px."""
+def _at_pixels(
+    points: np.ndarray, size: tuple[int, int], output: Output, tiles: int, reads: int
+) -> dict[str, Any]:
+    """The places of single points, x and y in px: (reads·H', reads·W', 2), or those of tiles below
+    each other."""
     if output == "tokens":
         raise ValueError("only a polar grid has tokens: choose the output 'image' or 'uint8'")
     x, y = points.transpose(2, 0, 1)
     inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
     x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
+    if reads > 1:
+        height, width = (side // reads for side in x.shape)
+        x, y = (v.reshape(height, reads, width, reads).swapaxes(1, 2) for v in (x, y))
+        x, y = (v.reshape(height, width, reads**2) for v in (x, y))
+    if tiles > 1:
+        x, y = (v.reshape(tiles, -1, *v.shape[1:]) for v in (x, y))
     columns, rows = np.floor(x), np.floor(y)
     return dict(
         columns=columns.astype(np.int16),

@@ -17,6 +17,7 @@ def sampler(
     scale: Sequence[float],
     offset: Sequence[float],
     output: str,
+    reads: int,
     /,
 ) -> _Sample: ...
 def polar_places(

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 from darswin.models.base import Model
-from darswin.views import PolarGrid, PolarView, View
+from darswin.views import PixelView, PolarGrid, PolarView, View
 from darswin.views.base import Pair, check_lens
 
 
@@ -23,6 +23,8 @@ class Reading(NamedTuple):
     # The normalization of frames; None if the sampling has none of its own.
     mean: float | Sequence[float] | None
     std: float | Sequence[float] | None
+    tiles: int = 1  # pictures below each other
+    reads: int = 1  # points along each side of a pixel
 
 
 @torch.no_grad()
@@ -49,4 +51,5 @@ def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
     if isinstance(view, PolarView):
         return Reading(points, view.layout, view.samples, channels, view.mean, view.std)
     assert isinstance(points, Tensor)
-    return Reading(points[0], "image", None, channels, view.mean, view.std)
+    reads = view.reads_of(size) if isinstance(view, PixelView) else 1
+    return Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)

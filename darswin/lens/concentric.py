@@ -51,12 +51,19 @@ def square_rays(
     like = lens.theta_max
     steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
     points = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    return rays_at(lens, points[None], spacing, theta_max)
+
+
+def rays_at(
+    lens: Lens, points: Tensor, spacing: Spacing, theta_max: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """`square_rays` of points (N or 1, ..., 2) of the square."""
     radius, direction = square_to_disc(points)
     if theta_max is not None:
-        theta = (theta_max * radius)[None]
-        return torch.where(lens.sees(theta), theta, torch.nan), direction[None]
-    first, last = (end[:, :, None] for end in span(lens, spacing))
-    return to_theta(lens, first + (last - first) * radius, spacing), direction[None]
+        theta = theta_max * radius
+        return torch.where(lens.sees(theta), theta, torch.nan), direction
+    first, last = (lens._row(end[:, 0], radius.dim()) for end in span(lens, spacing))
+    return to_theta(lens, first + (last - first) * radius, spacing), direction
 
 
 def square_view(
@@ -81,13 +88,19 @@ def square_points(
 ) -> Tensor:
     """(N, H, W, 2): the points in the square of the images' pixels; `OUTSIDE` where no ray of
     [0, θ_max] lands, also of a fixed `theta_max`."""
-    theta, direction = pixel_rays(lens, image_size)
+    return points_at(lens, *pixel_rays(lens, image_size), spacing, theta_max)
+
+
+def points_at(
+    lens: Lens, theta: Tensor, direction: Tensor, spacing: Spacing, theta_max: float | None = None
+) -> Tensor:
+    """`square_points` of rays (N, ...), with (cos φ, sin φ), (N or 1, ..., 2)."""
     seen = ~theta.isnan()  # NaN must not reach the gradients
     if theta_max is not None:
         seen = seen & (theta <= theta_max)
         points = disc_to_square(torch.where(seen, theta / theta_max, 0.0), direction)
         return torch.where(seen[..., None], points, OUTSIDE)
-    first, last = (end[:, :, None] for end in span(lens, spacing))
+    first, last = (lens._row(end[:, 0], theta.dim()) for end in span(lens, spacing))
     value = to_spacing(lens, torch.where(seen, theta, 0.0), spacing)
     radius = ((value - first) / (last - first)).clamp(max=1)
     points = disc_to_square(radius, direction)

@@ -1,5 +1,6 @@
 """Any network that takes square images, or other pixels, behind any lens."""
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -8,39 +9,49 @@ from torch.utils import _pytree as pytree
 
 from darswin.lens.spacing import Spacing
 from darswin.models.base import Model
+from darswin.models.detections import detections_to_images, find_detections
 from darswin.ops.checks import as_int
 from darswin.views import Prepared, View, make_view
 from darswin.views.base import Pair, PerChannel
+from darswin.views.directions import Vector
 
 
 class LensAdapter(Model[Any]):
     """Wraps any network of images so that it works with any lens.
 
-    The network runs on a view of the image: by default on the image disc, resampled to a square by
-    the concentric map. Results with 4 dimensions, (B, K, H', W') for any size, are resampled to the
-    pixels of the images, (B, K, H, W), and pixels that no ray reaches get 0. Other results, such as
-    logits of classes, are returned as they are. Lists, tuples and dicts of results may be nested.
+    The network runs on a view of the image, and its results come back to the pixels of the images:
 
-    In the square, the network sees equal steps of θ at equal distances from the centre, whatever
-    the lens is. It may come from timm, from segmentation_models_pytorch or from you, trained or
-    not. The adapter is called `adapter(images, lens)`. It gives images in floating point to the
-    network as they are.
+    - maps, results with 4 dimensions (B, K, H', W') for any size, are resampled to (B, K, H, W),
+      and pixels that no ray reaches get 0;
+    - detections, a dict of "boxes", "scores" and "labels" or a list of such dicts for each picture,
+      as torchvision returns them, become a list with a dict for each image: boxes in pixels of the
+      images, and "rays" (K, 3), the directions of their middles, and "visible" (K,), the share of
+      each box that the lens sees. The detections of several tiles are merged;
+    - other results, such as logits of classes, are returned as they are. A view of n tiles has n
+      for each image. Lists, tuples and dicts of results may be nested.
+
+    The network may come from timm, from segmentation_models_pytorch or from you, trained or not.
+    Pretrained weights want a view in which things stand upright and keep their shape: "mercator"
+    for one run per image, "tiles" for several. A network that is trained from scratch may take the
+    square, the default: the image disc by the concentric map, in which equal steps of θ are at
+    equal distances from the centre, whatever the lens is. The adapter is called `adapter(images,
+    lens)`. It gives images in floating point to the network as they are.
 
     Args:
         network: a module that takes images (B, C, H', W').
         size: (H', W') of the view in pixels, or the side of a square. A `View` has its own size.
-        spacing, theta_max: options of the view; None means the view's own default. See
-            `SquareView`.
+        spacing, theta_max, max_fov, fov, up, direction, count: options of the view; None means the
+            view's own default, and views refuse the options of others.
         view: the name of a view, one of `list_views()`; or a `View`, with its own options.
-        max_fov: an option of the view "perspective"; see `PerspectiveView`.
         mean, std: the normalization of uint8 images that the network expects, `(pixel/255 - mean) /
             std`, one number or one for each channel. None refuses uint8 images.
         output: "pixels" resamples results with 4 dimensions as described; "view" returns all
             results as the network made them, in the view.
+        boxes: a function that makes detections of the network's results, if they have another form.
 
     Raises:
         ValueError: the size is below 1, an option of the view is wrong, the output is unknown, or
-            mean and std do not fit together.
+            mean and std do not fit together; in forward, the number of detections does not fit.
         TypeError: in forward, images of uint8 without mean and std.
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
@@ -58,14 +69,22 @@ class LensAdapter(Model[Any]):
         *,
         view: str | View = "square",
         max_fov: float | None = None,
+        fov: float | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
+        count: int | None = None,
         mean: PerChannel | None = None,
         std: PerChannel | None = None,
         output: Literal["pixels", "view"] = "pixels",
+        boxes: Callable[[Any], Any] | None = None,
     ):
         super().__init__()
         if output not in ("pixels", "view"):
             raise ValueError(f"output must be 'pixels' or 'view', got {output!r}")
-        options = dict(spacing=spacing, theta_max=theta_max, max_fov=max_fov)
+        options = dict(
+            spacing=spacing, theta_max=theta_max, max_fov=max_fov, fov=fov, up=up,
+            direction=direction, count=count,
+        )  # fmt: skip
         if isinstance(view, View):
             given = dict(options, size=size, mean=mean, std=std)
             if wrong := [name for name, value in given.items() if value is not None]:
@@ -75,15 +94,20 @@ class LensAdapter(Model[Any]):
             self.view = view
         else:
             self.view = make_view(view, _pair(size), mean=mean, std=std, **options)
-        self.network, self.output = network, output
+        self.network, self.output, self.boxes = network, output, boxes
         self.goes_back = output == "pixels"
+        self.reads_rays = self.goes_back and self.view.uses_lens  # detections come with rays
         if self.mean is None:
             self._looks = 0  # the network may expect any values
 
     def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
         results = self.network(x)
+        if self.boxes is not None:
+            results = self.boxes(results)
         if self.output == "view":
             return results
+        if (found := find_detections(results)) is not None:
+            return detections_to_images(found, self.view, prepared)
 
         def to_images(out: Any) -> Any:
             has_pixels = isinstance(out, Tensor) and out.dim() == 4

@@ -12,7 +12,8 @@ from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StageSizes, stage_sizes
 from darswin.ops.checks import per_channel
 from darswin.views import make_view
-from darswin.views.base import Pair, PerChannel
+from darswin.views.base import Pair, PerChannel, check_one_picture
+from darswin.views.directions import Vector
 
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 
@@ -30,15 +31,15 @@ class Swin(Encoder):
         window: (rows, columns) on maps that are large enough.
         view: the name of a view whose pixels the network sees, one of `list_views()`. "none" takes
             the images as they are and ignores the lens. The others resample the images to a view of
-            this size through the lens: "perspective" with the option `max_fov`, "square" with
-            `spacing` and `theta_max`.
-        max_fov, spacing, theta_max: options of the view; None means the view's own default.
+            this size through the lens.
+        max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
+            own default, and views refuse the options of others.
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
             point are not normalized.
 
     Raises:
-        ValueError: an unknown option, or sizes that do not divide; in forward, images of another
-            size.
+        ValueError: an unknown option, a view of several pictures, or sizes that do not divide; in
+            forward, images of another size.
         TypeError: in forward, the lens is missing and the view uses it.
 
     Source: Swin Transformer, ICCV 2021; at 64 px with patches of 2 and windows of 4 as in DarSwin,
@@ -64,6 +65,9 @@ class Swin(Encoder):
         max_fov: float | None = None,
         spacing: Spacing | None = None,
         theta_max: float | None = None,
+        fov: float | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
         mean: PerChannel = 0.0,
         std: PerChannel = 1.0,
     ):
@@ -73,9 +77,11 @@ class Swin(Encoder):
         height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
         self.image_size = height, width
         self.view = make_view(
-            view, self.image_size, max_fov=max_fov, spacing=spacing, theta_max=theta_max,
+            view, self.image_size, max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov,
+            up=up, direction=direction,
             mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
         )  # fmt: skip
+        check_one_picture(self.view)
         if patch_size < 1 or any(side < 1 or side % patch_size for side in (height, width)):
             raise ValueError(
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"

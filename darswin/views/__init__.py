@@ -10,12 +10,24 @@ from darswin.views.base import (
     make_view,
     register_view,
 )
+from darswin.views.cylindrical import CylindricalView
+from darswin.views.directions import RayView, up_of
+from darswin.views.equirectangular import EquirectangularView
+from darswin.views.mercator import MercatorView
+from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.plain import PlainView
 from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.square import SquareView
+from darswin.views.stereographic import StereographicView
+from darswin.views.tangent import TangentView
+from darswin.views.tiles import TilesView
 
 __all__ = [
+    "CylindricalView",
+    "EquirectangularView",
+    "MercatorView",
+    "PanoramaView",
     "PerspectiveView",
     "PixelGrid",
     "PixelView",
@@ -24,10 +36,15 @@ __all__ = [
     "PolarSample",
     "PolarView",
     "Prepared",
+    "RayView",
     "SquareView",
+    "StereographicView",
+    "TangentView",
+    "TilesView",
     "View",
     "list_views",
     "make_view",
     "polar_grid",
     "register_view",
+    "up_of",
 ]

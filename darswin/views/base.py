@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +22,7 @@ from darswin.ops.reference import normalized
 
 Pair = tuple[int, int]
 PerChannel = float | Sequence[float]
+Points = TypeVar("Points", np.ndarray, Tensor)
 
 
 class PolarGrid(NamedTuple):
@@ -96,11 +98,13 @@ class View(nn.Module):
         uses_lens: False if the view ignores its lens, which may then be None.
         in_pixels: True if the network sees pixels (B, C, H', W'), False for tokens (B, R, A, S).
         coordinates: the number of coordinates of a token's position.
+        count: the number of pictures that the network sees of each image.
     """
 
     uses_lens = True
     in_pixels = True
     coordinates = 2
+    count = 1
 
     def __init__(self, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0):
         super().__init__()
@@ -213,6 +217,39 @@ class PixelView(View):
         """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
         raise NotImplementedError
 
+    def reads_of(self, size: Pair) -> int:
+        """The points along each side of a pixel at which images of (H, W) are read."""
+        return 1
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN
+        where the view shows nothing. size: (H, W) of the images of N lenses."""
+        raise NotImplementedError
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """The inverse of `to_rays`: pixels (N, ..., 2) of the view, which may be outside of it."""
+        raise NotImplementedError
+
+    def to_image(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
+        """Pixels (..., 2) of the view → pixels (..., 2) of images of (H, W), exactly.
+
+        Args:
+            points: x and y, a NumPy array or a tensor; computed in float64.
+            lens: one lens. size: (H, W) of its images.
+            of_tile: `tile=k`, the number of the tile, if the view has tiles.
+
+        Returns:
+            Points as given, which may be outside of the image; NaN where no ray lands.
+        """
+        return _exactly(points, lens, lambda pixels, exact: exact.project_points(
+            self.to_rays(pixels, exact, size, **of_tile), size))  # fmt: skip
+
+    def to_view(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
+        """Pixels (..., 2) of images of (H, W) → pixels (..., 2) of the view: the inverse of
+        `to_image`, with its arguments."""
+        return _exactly(points, lens, lambda pixels, exact: self.to_points(
+            exact.unproject_points(pixels, size), exact, size, **of_tile))  # fmt: skip
+
     def prepare(
         self,
         lens: Lens | None,
@@ -243,15 +280,19 @@ class PixelView(View):
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
         assert isinstance(prepared.back, Tensor) and self.size is not None
-        points, size = prepared.back, tuple(maps.shape[2:])
-        if size != self.size:  # the outermost pixels of a coarser map extend to the edges
-            there, scale = (
-                tensor_there(sides[::-1], points)
-                for sides in (size, [of / to for of, to in zip(size, self.size, strict=True)])
-            )
-            inside = torch.minimum(((points + 0.5) * scale - 0.5).clamp(min=0), there - 1)
-            points = torch.where(points == OUTSIDE, OUTSIDE, inside)
+        points, size = prepared.back, (maps.shape[2], maps.shape[3])
+        if size != self.size:
+            points = torch.where(points == OUTSIDE, OUTSIDE, self.scaled(points, size))
         return sample_at(maps, points)
+
+    def scaled(self, points: Tensor, size: Pair) -> Tensor:
+        """Points of the view in a map of another size. Its outermost pixels extend to the edges."""
+        assert self.size is not None
+        there, scale = (
+            tensor_there(sides[::-1], points)
+            for sides in (size, [of / to for of, to in zip(size, self.size, strict=True)])
+        )
+        return torch.minimum(((points + 0.5) * scale - 0.5).clamp(min=0), there - 1)
 
     def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
         seen = check_seen_images(seen, self.size or prepared.size, channels)
@@ -261,6 +302,18 @@ class PixelView(View):
 
     def extra_repr(self) -> str:
         return f"size={self.size}"
+
+
+def _exactly(points: Points, lens: Lens, move: Callable[[Tensor, Lens], Tensor]) -> Points:
+    """Moves points (..., 2) through one lens in float64."""
+    if len(lens) != 1:
+        raise ValueError(f"points move through one lens, got {len(lens)}")
+    if isinstance(points, np.ndarray):
+        exact = torch.from_numpy(points.astype(np.float64))
+        moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
+        return moved.numpy().astype(np.result_type(points, np.float32), copy=False)
+    moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]
+    return moved.to(torch.promote_types(points.dtype, torch.float32))
 
 
 def _centers(size: Pair, device: torch.device | None) -> Tensor:
@@ -289,6 +342,15 @@ def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
             f"sampled must have the size of the view, (H, W) = {size}, got {tuple(seen.shape[2:])}"
         )
     return seen
+
+
+def check_one_picture(view: View) -> None:
+    """ValueError for a view that shows several pictures of each image."""
+    if view.count != 1:
+        raise ValueError(
+            f"this model takes one picture of each image, but the view shows {view.count}: put a "
+            "network behind them with LensAdapter"
+        )
 
 
 def check_lens(lens: Lens | None, size: Pair) -> Lens:

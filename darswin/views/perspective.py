@@ -49,6 +49,12 @@ class PerspectiveView(PixelView):
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         return pixels.pixel_rays(self._lens(lens), self.size)
 
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return self._lens(lens).unproject_points(points, self.size)
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return self._lens(lens).project_points(rays, self.size)
+
     def _lens(self, lens: Lens) -> Lens:
         return pixels.perspective_view(lens, self.size, self.max_fov)
 

@@ -5,7 +5,7 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.lens import pixels
+from darswin.lens import Lens, pixels
 from darswin.views.base import Pair, PixelView, Prepared, register_view
 
 
@@ -28,6 +28,12 @@ class PlainView(PixelView):
 
     def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
         return pixels.pixel_rays(lens, size)
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return lens.unproject_points(points, size)
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return lens.project_points(rays, size)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
         if maps.shape[2:] == prepared.size:

@@ -1,9 +1,19 @@
 """The image disc as a square."""
 
+import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.concentric import read_square, square_points, square_rays, square_view
+from darswin.lens.concentric import (
+    points_at,
+    rays_at,
+    read_square,
+    square_points,
+    square_rays,
+    square_view,
+)
+from darswin.lens.pixels import OUTSIDE
+from darswin.lens.solve import length_of, vector_of
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.views.base import Pair, PerChannel, PixelView, Prepared, register_view
 
@@ -57,6 +67,21 @@ class SquareView(PixelView):
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         return square_rays(lens, self.size[0], self.spacing, self.theta_max)
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        square = (2 * points + 1) / self.size[0] - 1
+        theta, direction = rays_at(lens, square, self.spacing, self.theta_max)
+        inside = (square.abs().amax(-1) <= 1) & lens.sees(theta)
+        return torch.where(inside[..., None], vector_of(theta, direction), torch.nan)
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        aside = length_of(rays[..., :2])
+        theta = torch.atan2(aside, rays[..., 2])
+        theta = torch.where(lens.sees(theta), theta, torch.nan)
+        direction = rays[..., :2] / aside[..., None]
+        square = points_at(lens, theta, direction, self.spacing, self.theta_max)
+        points = ((square + 1) * self.size[0] - 1) / 2
+        return torch.where(square == OUTSIDE, torch.nan, points)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
         assert isinstance(prepared.back, Tensor)

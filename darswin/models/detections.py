@@ -1,0 +1,106 @@
+"""Detections of networks behind views, carried back to the pixels of the images."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin import boxes as of_boxes
+from darswin.lens.pixels import OUTSIDE
+from darswin.utils.tables import read_table
+from darswin.views import PolarGrid, Prepared, View
+
+NAMES = ("boxes", "scores", "labels")
+
+
+def find_detections(results: Any) -> list[Mapping[str, Tensor]] | None:
+    """The detections for each picture if a network's results are some, or None.
+
+    They are a dict of boxes, scores and labels with a batch axis, or a list of dicts without it, as
+    torchvision returns them.
+    """
+    if isinstance(results, Mapping) and _has_boxes(results):
+        if results["boxes"].dim() == 2:
+            return [results]
+        parts = zip(*(value for value in results.values()), strict=True)
+        return [dict(zip(results, part, strict=True)) for part in parts]
+    is_list = isinstance(results, (list, tuple)) and len(results) > 0
+    return list(results) if is_list and all(map(_has_boxes, results)) else None
+
+
+def _has_boxes(found: Any) -> bool:
+    names = isinstance(found, Mapping) and set(NAMES) <= set(found)
+    return names and all(isinstance(found[name], Tensor) for name in NAMES)
+
+
+def detections_to_images(
+    found: Sequence[Mapping[str, Tensor]], view: View, prepared: Prepared
+) -> list[dict[str, Tensor]]:
+    """Carries the detections of the pictures that a view shows to the pixels of the images.
+
+    Args:
+        found: for each picture, boxes (K, 4), scores (K,), labels (K,), and any other values (K,
+            ...), which stay as they are. The coordinates are torchvision's.
+
+    Returns:
+        For each image, the same dicts. The boxes are cut at the borders of the image, and those of
+        several tiles are merged, the best first. "visible" (K,) is the share of each box that the
+        lens sees, and boxes that it does not see are left out. "rays" (K, 3) are the directions of
+        the middles in the camera's frame, unless the view ignores the lens.
+    """
+    if len(found) % view.count:
+        raise ValueError(
+            f"the network must give detections for all {view.count} tiles of each image, got "
+            f"{len(found)} results"
+        )
+    images = [found[k : k + view.count] for k in range(0, len(found), view.count)]
+    if isinstance(prepared.points, PolarGrid):
+        raise ValueError("boxes cannot come back from a polar image: choose another view")
+    points = _tables(prepared.points, view.count)
+    rays = _tables(None if prepared.rays is None else prepared.rays.movedim(1, -1), view.count)
+    results = []
+    for k, tiles in enumerate(images):
+        carried = [
+            _carried(part, *(of[min(k, len(of) - 1)][tile] for of in (points, rays)))
+            for tile, part in enumerate(tiles)
+        ]
+        joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
+        joined["boxes"] = of_boxes.clip(joined["boxes"], prepared.size)
+        seen = joined["visible"] > 0
+        joined = {name: value[seen] for name, value in joined.items()}
+        if view.count > 1:
+            kept = of_boxes.merge(*(joined[name] for name in NAMES))
+            joined = {name: value[kept] for name, value in joined.items()}
+        results.append(joined)
+    return results
+
+
+def _tables(values: Tensor | None, count: int) -> Any:
+    """Values of the pixels of n tiles below each other, (N, n·H', W', K), as N × n arrays (H', W',
+    K) with NaN in place of `OUTSIDE`; None if the view is the image."""
+    if values is None:
+        return [[None] * count]
+    table = values.detach().double().cpu().unflatten(1, (count, -1)).numpy()
+    return np.where(table == OUTSIDE, np.nan, table)
+
+
+def _carried(
+    found: Mapping[str, Tensor], points: np.ndarray | None, rays: np.ndarray | None
+) -> dict[str, Tensor]:
+    """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image along
+    rays (H', W', 3)."""
+    boxes = found["boxes"]
+    if points is None:  # the picture is the image
+        return dict(found) | dict(visible=torch.ones_like(found["scores"]))
+    assert rays is not None
+    reads = points.shape[0] // rays.shape[0]
+    carried, visible = of_boxes.carry(
+        boxes, lambda pixels: read_table(points, (pixels + 0.5) * reads - 0.5)
+    )
+    middle = boxes.detach().double().cpu().unflatten(1, (2, 2)).mean(1).numpy() - 0.5
+    inside = np.clip(middle, 0, [rays.shape[1] - 1, rays.shape[0] - 1])
+    ray = torch.from_numpy(read_table(rays, inside)).to(boxes)
+    return dict(found) | dict(boxes=carried, visible=visible, rays=F.normalize(ray, dim=1))

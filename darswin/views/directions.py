@@ -1,0 +1,345 @@
+"""Views whose pixels look along rays of the camera: maps of the sphere, upright if you know up."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.lens import Lens
+from darswin.lens.pixels import OUTSIDE, as_map
+from darswin.lens.solve import length_of
+from darswin.ops.checks import as_int, readable, tensor_there
+from darswin.utils.angles import degrees_hint
+from darswin.views.base import Pair, PerChannel, PixelView, Prepared
+
+Vector = Sequence[float] | Tensor
+
+PICTURE_TOP = (0.0, -1.0, 0.0)
+AXIS = (0.0, 0.0, 1.0)
+_STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
+_STEPS = 361  # points at which the end of what a lens sees is looked for
+_BISECTIONS = 16
+_APART = 1.5  # pixels of the image between points at which it is read
+_MOST_READS = 4
+
+
+class RayView(PixelView):
+    """A view whose pixels look along rays: a map of the sphere, with an exact inverse.
+
+    A subclass says which map, in functions between unit vectors (x, y, z), with x right, y down
+    and z forward in the view's own frame, and points of a plane, in rad at its middle.
+
+    Each pixel of the view is the mean of several points of the image if the view shrinks the
+    picture. Pixels that no ray of the lens reaches get 0.
+
+    Args:
+        size: (H', W') of the view.
+        fov: the horizontal field of view between the outer edges of a row, rad. The view then is
+            the same for all lenses, and its middle is `direction`. None shows all that each lens
+            sees in the picture: along the middle row, and as high as the size allows.
+        theta_max: the largest incident angle that is shown, rad; None means θ_max of each lens.
+        up: (x, y, z), the direction away from gravity in the camera's frame, of any length: x
+            right, y down, z forward. None means the top of the picture, (0, -1, 0). `up_of` makes
+            it from the roll and pitch of a camera, or from its extrinsics.
+        direction: (x, y, z), the middle of the view in the camera's frame, of any length. None
+            means the optical axis.
+        reads: the points along each side of a pixel at which the image is read. None means as many
+            as the sizes of the image and of the view suggest, for a picture that is 180° across.
+        mean, std: the arguments of `View`.
+
+    Raises:
+        ValueError: an angle is out of range, or a vector is not three finite numbers or is zero.
+            With a lens: the view sees nothing of it.
+    """
+
+    size: Pair
+    upright = False  # True if all columns are vertical in the world, and not only the middle one
+    at_horizon = False  # True if a view of a whole lens is near the horizon, not at `direction`
+    reach = math.pi  # the largest angle from the middle that a view of a whole lens shows, rad
+    widest = 2 * math.pi  # the largest fov
+
+    def __init__(
+        self,
+        size: Pair,
+        fov: float | None = None,
+        theta_max: float | None = None,
+        *,
+        up: Vector | None = None,
+        direction: Vector | None = None,
+        reads: int | None = None,
+        mean: PerChannel | None = 0.0,
+        std: PerChannel | None = 1.0,
+    ):
+        super().__init__(size, mean=mean, std=std)
+        for name, angle, most in (("fov", fov, self.widest), ("theta_max", theta_max, math.pi)):
+            if angle is not None and not 0 < angle <= most:
+                hint = degrees_hint(angle)
+                raise ValueError(f"{name} must be in (0, {most:.4g}] rad, got {angle}{hint}")
+        if reads is not None and (as_int(reads) or 0) < 1:
+            raise ValueError(f"reads must be an int of at least 1, got {reads!r}")
+        self.fov, self.theta_max, self.reads = fov, theta_max, reads
+        self.up = unit_vector("up", PICTURE_TOP if up is None else up)
+        self.direction = unit_vector("direction", AXIS if direction is None else direction)
+        self._frame = frame_of(self.up, self.direction, self.upright)
+
+    def to_plane(self, rays: Tensor) -> Tensor:
+        """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
+        raise NotImplementedError
+
+    def from_plane(self, points: Tensor) -> Tensor:
+        """The plane, (..., 2) → unit vectors (..., 3) in the view's frame; NaN where it ends."""
+        raise NotImplementedError
+
+    def half_width(self, angle: float) -> float:
+        """The x in the plane of a ray at an angle from the middle, to the right."""
+        return angle
+
+    # -- pixels and rays ----------------------------------------------------------------------
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """Pixels (N or 1, ..., 2) of the view → unit vectors (N or 1, ..., 3) in the camera's
+        frame; NaN where the view ends. size: (H, W) of the images of N lenses."""
+        step, middle = self._layout(lens, size)
+        dim = points.dim()
+        flat = (points - self._center(points)) * _row(step, dim) + _row(middle, dim)
+        return self.from_plane(flat) @ self._turn(points).T
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
+        of its size: the inverse of `to_rays`. NaN where the view shows nothing."""
+        step, middle = self._layout(lens, size)
+        shown = self._shows(rays := F.normalize(rays, dim=-1))
+        # NaN must not reach the gradients.
+        rays = torch.where(shown[..., None], rays, tensor_there(self.direction, rays))
+        flat = self.to_plane(rays @ self._turn(rays))
+        points = (flat - _row(middle, flat.dim())) / _row(step, flat.dim()) + self._center(flat)
+        return torch.where(shown[..., None], points, torch.nan)
+
+    def image_points(self, lens: Lens, size: Pair) -> Tensor:
+        return check_sees(self.read_points(lens, size), self, lens)
+
+    def read_points(self, lens: Lens, size: Pair) -> Tensor:
+        """`image_points` of a view that may see nothing of the lens: for each pixel, the points at
+        which it reads the image, (N, k·H', k·W', 2)."""
+        return as_map(self.place(lens, self._rays(lens, size, self.reads_of(size)), size))
+
+    def view_points(self, lens: Lens, size: Pair) -> Tensor:
+        grid = pixel_grid(size, lens.theta_max)
+        rays = lens.unproject_points(grid, size)
+        seen = ~rays.isnan().any(-1, keepdim=True)
+        rays = torch.where(seen, rays, tensor_there(self.direction, rays))
+        points = self.to_points(rays, lens, size)
+        return as_map(torch.where(seen, points, torch.nan))
+
+    def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        rays = self._rays(lens, size)
+        aside = length_of(rays[..., :2])
+        theta = torch.atan2(aside, rays[..., 2])
+        shown = lens.sees(theta) & self._shows(rays)
+        return torch.where(shown, theta, torch.nan), rays[..., :2] / aside[..., None]
+
+    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+        reads = self.reads_of(prepared.size)
+        seen = super().see(images, prepared, dtype)
+        return seen if reads == 1 else F.avg_pool2d(seen, reads)
+
+    def rays(self, lens: Lens, size: Pair) -> Tensor:
+        """The rays of the pixels, unit vectors (N, H', W', 3) in the camera's frame; 0 where the
+        lens or the view sees nothing. size: (H, W) of the images."""
+        prepared = PixelView.prepare(self, lens, size, back=False)
+        assert prepared.rays is not None
+        return prepared.rays.movedim(1, -1)
+
+    def _rays(self, lens: Lens, size: Pair, reads: int = 1) -> Tensor:
+        height, width = self.size
+        grid = pixel_grid((height * reads, width * reads), lens.theta_max)
+        return self.to_rays((grid + 0.5) / reads - 0.5, lens, size)
+
+    def place(self, lens: Lens, rays: Tensor, size: Pair) -> Tensor:
+        """The pixels of images of (H, W) at which rays land; NaN where the view shows nothing."""
+        shown = self._shows(rays)
+        safe = torch.where(shown[..., None], rays, tensor_there(AXIS, rays))
+        return torch.where(shown[..., None], lens.project_points(safe, size), torch.nan)
+
+    def _shows(self, rays: Tensor) -> Tensor:
+        """True for unit vectors (..., 3) within `theta_max`; False for NaN."""
+        least = -1.0 if self.theta_max is None else math.cos(self.theta_max)
+        return rays[..., 2] >= least - 1e-6
+
+    def reads_of(self, size: Pair) -> int:
+        # It must not depend on the values of a lens, which a compiled graph does not have.
+        if self.reads is not None:
+            return self.reads
+        shrinks = min(size) / min(self.size) * min(1.0, (self.fov or math.pi) / math.pi)
+        return min(max(math.ceil(shrinks / _APART), 1), _MOST_READS)
+
+    def _center(self, like: Tensor) -> Tensor:
+        return tensor_there([(side - 1) / 2 for side in self.size[::-1]], like)
+
+    def _turn(self, like: Tensor) -> Tensor:
+        """The rotation (3, 3) from the view's frame to the camera's."""
+        return torch.tensor(self._frame, dtype=like.dtype, device=like.device)
+
+    # -- what the view covers -----------------------------------------------------------------
+
+    @torch.no_grad()
+    def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
+        1, 2)."""
+        lens = lens.detach()
+        start = self._start(lens.theta_max)
+        if self.fov is not None:
+            return start.new_tensor([[2 * self.half_width(self.fov / 2) / self.size[1]]]), start
+        # Upright views are as wide as the lens sees on the horizon, if it sees that at all.
+        horizon = torch.zeros_like(start)
+        row = torch.where(self._sees(lens, horizon[None], size)[..., None], horizon, start)[:, 0]
+        left, right = self._across(lens, row, size)
+        upper, lower = (
+            self._end(lens, start, self._highest(start, sign), size)[:, 1] for sign in (-1, 1)
+        )
+        step = (right - left) / self.size[1]
+        if not self.upright:
+            step = torch.maximum(step, (lower - upper) / self.size[0])
+        half = step * (self.size[0] / 2)
+        first, last = upper + half, lower - half  # of the middles that show nothing unseen
+        wanted = (horizon if self.at_horizon else start)[:, 1]
+        y = torch.minimum(torch.maximum(wanted, first), last)
+        y = torch.where(first <= last, y, (upper + lower) / 2)
+        return step[:, None], torch.stack(((left + right) / 2, y), -1)
+
+    def _across(self, lens: Lens, row: Tensor, size: Pair) -> tuple[Tensor, Tensor]:
+        """The ends (N,) of what a lens sees along the row at points (N or 1, 2) of the plane."""
+        edge = self.half_width(self.reach)
+        left, right = (row + row.new_tensor([x, 0.0]) for x in (-edge, edge))
+        return self._end(lens, row, left, size)[:, 0], self._end(lens, row, right, size)[:, 0]
+
+    def _start(self, like: Tensor) -> Tensor:
+        """The point of the plane (1, 2) at `direction`, or at its nearest elevation that is not too
+        steep for a map of the sphere."""
+        if not self.upright:
+            return like.new_zeros(1, 2)
+        down = -sum(a * b for a, b in zip(self.direction, self.up, strict=True))
+        elevation = max(-_STEEPEST, min(_STEEPEST, math.asin(max(-1.0, min(1.0, down)))))
+        return self.to_plane(like.new_tensor([[0.0, math.sin(elevation), math.cos(elevation)]]))
+
+    def _highest(self, start: Tensor, sign: int) -> Tensor:
+        """The end of the column at `start`, (1, 2), upwards (-1) or downwards (1)."""
+        if not self.upright:
+            return start.new_tensor([[0.0, sign * self.half_width(self.reach)]])
+        steepest = (0.0, sign * math.sin(_STEEPEST), math.cos(_STEEPEST))
+        return self.to_plane(start.new_tensor([steepest]))
+
+    def _end(self, lens: Lens, start: Tensor, end: Tensor, size: Pair) -> Tensor:
+        """The last point of the plane that the images show from one point (N or 1, 2) to another,
+        (N, 2)."""
+        shares = torch.linspace(0, 1, _STEPS, dtype=start.dtype, device=start.device)
+
+        def at(share: Tensor) -> Tensor:
+            return start[:, None] + (end - start)[:, None] * share[..., None]
+
+        seen = self._sees(lens, at(shares[None]), size)
+        count = seen.int().cumprod(1).sum(1, keepdim=True)
+        low, high = (shares[(count + k).clamp(0, _STEPS - 1)] for k in (-1, 0))
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            inside = self._sees(lens, at(middle), size)
+            low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+        return at(low)[:, 0]
+
+    def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:
+        """True where images of (H, W) show points (N or 1, K, 2) of the plane, (N, K)."""
+        pixels = self.place(lens, self.from_plane(points) @ self._turn(points).T, size)
+        last = tensor_there((size[1] - 0.5, size[0] - 0.5), pixels)
+        return ((pixels >= -0.5) & (pixels <= last)).all(-1)
+
+    def extra_repr(self) -> str:
+        shown = dict(fov=self.fov, theta_max=self.theta_max, reads=self.reads)
+        given = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
+        for name, vector, usual in (("up", self.up, PICTURE_TOP),
+                                    ("direction", self.direction, AXIS)):  # fmt: skip
+            if vector != usual:
+                given.append(f"{name}=({', '.join(f'{x:.4g}' for x in vector)})")
+        return ", ".join([super().extra_repr(), *given])
+
+
+def check_sees(points: Tensor, view: PixelView, lens: Lens) -> Tensor:
+    """The points at which a view reads images; ValueError if no lens reaches any of them."""
+    if readable(points) and points.numel() and not (points > OUTSIDE).any():
+        raise ValueError(f"this view sees nothing of the lens: {view} of {lens}")
+    return points
+
+
+def pixel_grid(size: Pair, like: Tensor) -> Tensor:
+    """The pixels (x, y) of (H, W), (1, H, W, 2), with the dtype and the device of `like`."""
+    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
+
+
+def unit_vector(name: str, vector: Vector) -> tuple[float, float, float]:
+    """The unit vector of three finite numbers that are not all 0; ValueError otherwise."""
+    values = [float(x) for x in (vector.tolist() if hasattr(vector, "tolist") else vector)]
+    length = math.hypot(*values)
+    if len(values) != 3 or not 0 < length < math.inf:
+        raise ValueError(f"{name} must be three finite numbers that are not all 0, got {vector}")
+    x, y, z = (value / length for value in values)
+    return x, y, z
+
+
+def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> list[list[float]]:
+    """The rotation (3, 3) from the frame of a view to the camera's: its columns are the view's x, y
+    and z.
+
+    z is `direction`, and x is level. If the view is `upright`, y is straight down, and z is the
+    level part of `direction`. Where `direction` is straight up or down, the picture's top is level.
+    """
+    above, ahead = torch.tensor([up, direction], dtype=torch.float64)
+    right = torch.linalg.cross(ahead, above)
+    if right.norm() < 1e-6:
+        ahead_of_level = torch.tensor(PICTURE_TOP, dtype=torch.float64)
+        if torch.linalg.cross(ahead_of_level, above).norm() < 1e-6:
+            ahead_of_level = torch.tensor(AXIS, dtype=torch.float64)
+        right = torch.linalg.cross(ahead_of_level, above)
+    right = right / right.norm()
+    down = -above if upright else torch.linalg.cross(ahead, right)
+    forward = torch.linalg.cross(right, down) if upright else ahead
+    return torch.stack((right, down, forward), 1).tolist()
+
+
+def up_of(
+    roll: float = 0.0, pitch: float = 0.0, *, extrinsics: Tensor | Sequence | None = None,
+    world_up: Vector = (0.0, 0.0, 1.0),
+) -> tuple[float, float, float]:  # fmt: skip
+    """The direction away from gravity in a camera's frame, for the argument `up` of views.
+
+    Args:
+        roll: the angle by which the camera is turned clockwise about its optical axis, as seen from
+            behind it, rad.
+        pitch: the angle by which the optical axis is raised above the horizon, rad.
+        extrinsics: in place of roll and pitch, the rotation (3, 3) or pose (3 or 4, 4) that takes
+            vectors of the camera to the world's or the vehicle's frame.
+        world_up: the direction away from gravity in that frame.
+
+    Raises:
+        ValueError: roll and pitch are given with extrinsics, or these hold no rotation.
+    """
+    if extrinsics is None:
+        level = math.cos(pitch)
+        return unit_vector(
+            "up", (-level * math.sin(roll), -level * math.cos(roll), math.sin(pitch))
+        )
+    if roll or pitch:
+        raise ValueError("give either extrinsics, or roll and pitch")
+    pose = torch.as_tensor(extrinsics, dtype=torch.float64)
+    shape = tuple(pose.shape)
+    rotation = pose[:3, :3] if shape in ((3, 3), (3, 4), (4, 4)) else pose.new_zeros(3, 3)
+    if not torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4):
+        raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
+    up = rotation.T @ torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
+    return unit_vector("up", up)
+
+
+def _row(values: Tensor, dim: int) -> Tensor:
+    """(N, K) → (N, 1, …, K) with `dim` dimensions."""
+    return values.view(values.shape[0], *(1,) * (dim - 2), values.shape[1])

@@ -1,0 +1,31 @@
+"""A stereographic picture, as a lens that keeps the shape of things would take it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from darswin.views.base import register_view
+from darswin.views.directions import RayView
+
+
+@register_view("stereographic")
+class StereographicView(RayView):
+    """A stereographic picture: things keep their shape, and lean away from the middle.
+
+    The middle column is level with `up`. The arguments and errors are those of `RayView`.
+    """
+
+    reach = math.radians(170)
+    widest = 2 * reach
+
+    def half_width(self, angle: float) -> float:
+        return 2 * math.tan(angle / 2)
+
+    def to_plane(self, rays: Tensor) -> Tensor:
+        # Straight behind, the scale is infinite.
+        return 2 * rays[..., :2] / (1 + rays[..., 2:]).clamp(min=1e-12)
+
+    def from_plane(self, points: Tensor) -> Tensor:
+        square = points.square().sum(-1, keepdim=True) / 4
+        return torch.cat((points, 1 - square), -1) / (1 + square)

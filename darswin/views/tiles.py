@@ -1,0 +1,187 @@
+"""Several stereographic pictures that cover what a camera sees, for a network that runs on each."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from darswin.lens import Lens
+from darswin.lens.pixels import OUTSIDE, sample_at
+from darswin.lens.solve import direction_of, vector_of
+from darswin.utils.angles import degrees_hint
+from darswin.views.base import (
+    Pair,
+    PerChannel,
+    PixelView,
+    Prepared,
+    check_count,
+    check_seen_images,
+    register_view,
+)
+from darswin.views.directions import (
+    AXIS,
+    PICTURE_TOP,
+    Vector,
+    check_sees,
+    frame_of,
+    unit_vector,
+)
+from darswin.views.stereographic import StereographicView
+
+# For each count: whether a tile is in the middle; and in degrees, for fields of view from 165°, the
+# angle of the others from the middle, their first azimuth, and the field of view of a tile.
+_LAYOUTS = {
+    4: (False, 50, 0, 100),
+    5: (True, 60, 0, 100),
+    6: (True, 60, -90, 90),
+    7: (True, 60, -90, 85),
+    8: (True, 60, -90, 80),
+    9: (True, 60, 0, 80),
+}
+_WHOLE = math.radians(165)  # for wider lenses, tiles that look farther aside found no more
+
+
+@register_view("tiles")
+class TilesView(PixelView):
+    """4 to 9 stereographic pictures that together cover what a camera sees.
+
+    A network sees B·n images, the n tiles of each image in turn. Its maps come back to the pixels
+    of the images: each pixel takes the tile in which it is farthest from a border. A `LensAdapter`
+    carries boxes back and merges those of all tiles. Each tile is level with `up`.
+
+    Args:
+        size: (H', W') of a tile. Tiles that are much smaller than 512 pixels find less than one
+            view of the whole picture.
+        count: n, from 4 to 9.
+        fov: the field of view that the tiles cover together, rad. The default suits lenses of 165°
+            and more.
+        theta_max: the largest incident angle that is shown, rad; None means θ_max of each lens.
+        tile_fov: the horizontal field of view of a tile, rad; None suits `count` and `fov`.
+        directions: (n, 3), the middles of the tiles in the camera's frame, in place of `count`,
+            `fov` and `direction`; `tile_fov` must be given too.
+        up, direction, reads: see `RayView`; `direction` is the middle of the whole.
+        mean, std: the arguments of `View`.
+
+    Raises:
+        ValueError: `count` is not in 4 … 9, or an argument is wrong as for `RayView`.
+    """
+
+    size: Pair
+
+    def __init__(
+        self,
+        size: Pair,
+        count: int = 5,
+        fov: float = _WHOLE,
+        theta_max: float | None = None,
+        *,
+        tile_fov: float | None = None,
+        directions: Sequence[Vector] | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
+        reads: int | None = None,
+        mean: PerChannel | None = 0.0,
+        std: PerChannel | None = 1.0,
+    ):
+        super().__init__(size, mean=mean, std=std)
+        if not 0 < fov <= 2 * math.pi:
+            raise ValueError(f"fov must be in (0, 2π] rad, got {fov}{degrees_hint(fov)}")
+        if directions is None:
+            if count not in _LAYOUTS:
+                raise ValueError(
+                    f"count must be from {min(_LAYOUTS)} to {max(_LAYOUTS)}, got {count}"
+                )
+            share = min(1.0, fov / _WHOLE)
+            directions = _directions(count, share, up, direction)
+            tile_fov = tile_fov or math.radians(_LAYOUTS[count][3]) * share
+        elif tile_fov is None:
+            raise ValueError("tile_fov must be given with directions")
+        self.tiles = [
+            StereographicView(
+                size, tile_fov, theta_max, up=up, direction=middle, reads=reads, mean=mean, std=std
+            )
+            for middle in directions
+        ]
+        self.count = len(self.tiles)
+
+    def image_points(self, lens: Lens, size: Pair) -> Tensor:
+        """The points of the tiles below each other, (N, n·H', W', 2) px."""
+        points = torch.cat([tile.read_points(lens, size) for tile in self.tiles], 1)
+        return check_sees(points, self, lens)
+
+    def view_points(self, lens: Lens, size: Pair) -> Tensor:
+        """The points of the tiles below each other that the pixels of the images show."""
+        height, width = self.size
+        best = torch.full((1,), -0.5)
+        found = torch.full((1, 2), OUTSIDE)
+        best, found = best.to(lens.theta_max), found.to(lens.theta_max)
+        for k, tile in enumerate(self.tiles):
+            x, y = tile.view_points(lens, size).unbind(-1)
+            margin = torch.stack((x, width - 1 - x, y, height - 1 - y)).amin(0)
+            inner = margin > best
+            best = torch.where(inner, margin, best)
+            found = torch.where(inner[..., None], torch.stack((x, y + k * height), -1), found)
+        return found
+
+    def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        theta, direction = zip(*(tile.pixel_rays(lens, size) for tile in self.tiles), strict=True)
+        return torch.cat(theta, 1), torch.cat(direction, 1)
+
+    def reads_of(self, size: Pair) -> int:
+        return self.tiles[0].reads_of(size)
+
+    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+        seen = self.tiles[0].see(images, prepared, dtype)
+        return seen.unflatten(2, (self.count, -1)).transpose(1, 2).flatten(0, 1)
+
+    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        assert isinstance(prepared.back, Tensor)
+        rows = prepared.back[..., 1]
+        tile = torch.floor((rows + 0.5) / self.size[0])
+        inner = torch.stack((prepared.back[..., 0], rows - tile * self.size[0]), -1)
+        x, y = self.tiles[0].scaled(inner, (maps.shape[2], maps.shape[3])).unbind(-1)
+        points = torch.stack((x, y + tile * maps.shape[2]), -1)
+        stacked = maps.unflatten(0, (-1, self.count)).transpose(1, 2).flatten(2, 3)
+        return sample_at(stacked, torch.where(prepared.back == OUTSIDE, OUTSIDE, points))
+
+    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+        seen = check_seen_images(seen, self.size, channels)
+        if seen.shape[0] % self.count:
+            raise ValueError(
+                f"sampled must have {self.count} tiles for each image, got {seen.shape[0]}"
+            )
+        assert isinstance(prepared.points, Tensor)
+        check_count(prepared.points.shape[0], seen[:: self.count])
+        return seen
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair, tile: int = 0) -> Tensor:
+        """`RayView.to_rays` of one tile."""
+        return self.tiles[tile].to_rays(points, lens, size)
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair, tile: int = 0) -> Tensor:
+        """`RayView.to_points` of one tile."""
+        return self.tiles[tile].to_points(rays, lens, size)
+
+    def rays(self, lens: Lens, size: Pair) -> Tensor:
+        """The rays of the pixels of the tiles, unit vectors (N, n, H', W', 3); see `RayView`."""
+        return torch.stack([tile.rays(lens, size) for tile in self.tiles], 1)
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, count={self.count}, of {self.tiles[0].extra_repr()}"
+
+
+def _directions(
+    count: int, share: float, up: Vector | None, direction: Vector | None
+) -> list[list[float]]:
+    """The middles of the tiles of a layout, level with `up`."""
+    in_middle, angle, first, _ = _LAYOUTS[count]
+    axis = unit_vector("direction", AXIS if direction is None else direction)
+    frame = torch.tensor(
+        frame_of(unit_vector("up", PICTURE_TOP if up is None else up), axis, False)
+    )
+    around = count - in_middle
+    azimuth = math.radians(first) + torch.arange(around) * (2 * math.pi / around)
+    theta = torch.full((around,), math.radians(angle) * share)
+    ring = vector_of(theta, direction_of(azimuth)) @ frame.T
+    return [list(axis)] * in_middle + ring.tolist()

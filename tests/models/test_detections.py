@@ -1,0 +1,178 @@
+"""Detections of networks behind views, in the pixels of the images."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from darswin import boxes as of_boxes
+from darswin.lens import Equidistant, KannalaBrandt, Spherical
+from darswin.models import LensAdapter
+from darswin.views import list_views, make_view
+
+SIZE = (240, 320)
+LENSES = {
+    "radial": Spherical.from_fov(0.5, 2.8, 120.0, image_size=SIZE),
+    "beyond 90°": Equidistant(72.0, math.radians(95), center=[163.0, 118.0], image_size=SIZE),
+    "general": KannalaBrandt(
+        80.0, [0.01], 1.4, center=[158.0, 121.0], affine=[[1.0, 0.02], [0.0, 1.05]],
+        tangential=[0.01, 0.005], image_size=SIZE,
+    ),
+}  # fmt: skip
+VIEWS = sorted(set(list_views()) - {"polar"})
+
+
+class Disks(nn.Module):
+    """A detector of disks, each in a channel of its own: the box of its bright pixels."""
+
+    def __init__(self, form):
+        super().__init__()
+        self.form = form
+
+    def forward(self, x):
+        found = []
+        for picture in x:
+            boxes, scores, labels = [], [], []
+            for label, channel in enumerate(picture):
+                down, across = (channel > 0.5).nonzero(as_tuple=True)
+                if len(down) < 8:
+                    continue
+                ends = (across.min(), down.min(), across.max() + 1, down.max() + 1)
+                boxes.append(torch.stack(ends))
+                scores.append(len(down) / 1e5)  # whole disks are larger than cut ones
+                labels.append(label)
+            of_picture = torch.stack(boxes).float() if boxes else torch.zeros(0, 4)
+            labels = torch.tensor(labels, dtype=torch.long)
+            found.append(dict(boxes=of_picture, scores=torch.tensor(scores), labels=labels))
+        return found if self.form == "list" else dict(found=found)
+
+
+# θ and azimuth of the middles of cones of 6°, rad.
+CONES = ((0.05, 1.0), (0.5, 0.2), (0.8, 2.5), (0.95, -1.9))
+
+
+def disks(lens):
+    """A picture with a channel for each cone, and the exact boxes of the cones."""
+    grid = torch.stack(torch.meshgrid(torch.arange(320.0), torch.arange(240.0), indexing="xy"), -1)
+    rays = lens.unproject_points(grid[None], SIZE)[0].nan_to_num()
+    image, boxes = torch.zeros(1, len(CONES), *SIZE), []
+    for k, (theta, phi) in enumerate(CONES):
+        middle = torch.tensor([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi),
+                               math.cos(theta)])  # fmt: skip
+        inside = rays @ middle > math.cos(math.radians(6))
+        image[0, k, inside] = 1.0
+        y, x = inside.nonzero(as_tuple=True)
+        boxes.append([x.min(), y.min(), x.max() + 1, y.max() + 1])
+    return image, torch.tensor(boxes).float()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_boxes_of_every_view_come_back_to_the_things_in_the_picture(name, lens):
+    images, exact = disks(lens)
+    size = {"none": SIZE, "tiles": (320, 320)}.get(name, (480, 480))
+    detector = LensAdapter(Disks("list"), view=make_view(name, size))
+    (found,) = detector(images, lens)
+    shows = slice(0, 3) if name == "tangent" else slice(None)  # it ends at 50°
+    if name == "perspective" and lens.theta_max > 1.5:
+        shows = slice(2, 4)  # the middle is a few pixels
+    assert set(found["labels"].tolist()) >= set(range(4)[shows])
+    overlap = of_boxes.iou(found["boxes"], exact)
+    best = {k: overlap[found["labels"] == k, k].max().item() for k in range(4)[shows]}
+    # The square shears things along its diagonals; the middle of a perspective view is coarse.
+    least, mean = (0.6, 0.75) if name in ("square", "perspective") else (0.75, 0.85)
+    assert min(best.values()) > least and np.mean([*best.values()]) > mean, best
+    if name == "none":
+        assert torch.equal(found["boxes"], exact) and "rays" not in found
+        return
+    whole = found["visible"] == 1
+    places = lens.project_points(found["rays"][None], SIZE)[0]
+    middles = found["boxes"].unflatten(1, (2, 2)).mean(1) - 0.5
+    assert (places - middles)[whole].norm(dim=1).max() < 2.5
+    if name == "tiles":  # each thing is found once, though several tiles see it
+        assert sorted(found["labels"].tolist()) == [0, 1, 2, 3]
+        assert found["scores"].tolist() == sorted(found["scores"].tolist(), reverse=True)
+
+
+@torch.no_grad()
+def test_every_form_of_detections_gives_the_same():
+    lens, (images, _) = LENSES["radial"], disks(LENSES["radial"])
+    images = torch.cat((images, images.flip(3)))
+    view = make_view("tiles", (256, 256))
+    as_list = LensAdapter(Disks("list"), view=view)(images, lens)
+    by_function = LensAdapter(Disks("dict"), view=view, boxes=lambda out: out["found"])
+    assert [len(found["boxes"]) for found in as_list] == [4, 4]
+    for one, other in zip(as_list, by_function(images, lens), strict=True):
+        assert all(torch.equal(one[name], other[name]) for name in one)
+
+    class Batched(nn.Module):  # all pictures have as many boxes, with more values of each
+        def forward(self, x):
+            boxes = torch.tensor([[20.0, 30.0, 60.0, 90.0], [100.0, 90.0, 160.0, 150.0]])
+            rows = torch.arange(len(x) * 2.0).view(-1, 2)
+            return dict(
+                boxes=boxes.expand(len(x), -1, -1), scores=rows, labels=rows.long(), own=rows
+            )
+
+    view = make_view("mercator", (200, 200))
+    batched = LensAdapter(Batched(), view=view)(images, lens)
+    assert [found["own"].tolist() for found in batched] == [[0, 1], [2, 3]]
+    boxes = torch.tensor([[20.0, 30.0, 60.0, 90.0], [100.0, 90.0, 160.0, 150.0]])
+    exact, _ = of_boxes.carry(boxes, lambda p: view.to_image(p, lens, SIZE))
+    for found in batched:
+        torch.testing.assert_close(found["boxes"], exact, rtol=0, atol=0.02)
+    single = LensAdapter(_Constant(boxes), view=view)(images[:1], lens)
+    assert torch.equal(single[0]["boxes"], batched[0]["boxes"])
+    as_seen = LensAdapter(_Constant(boxes), view=view, output="view")(images[:1], lens)
+    assert torch.equal(as_seen["boxes"], boxes)
+
+
+class _Constant(nn.Module):
+    """A network that finds the same boxes in every picture, for batches of one picture."""
+
+    def __init__(self, boxes):
+        super().__init__()
+        self.found = boxes
+
+    def forward(self, x):
+        count = len(self.found)
+        return dict(boxes=self.found, scores=torch.linspace(1, 0.5, count),
+                    labels=torch.zeros(count, dtype=torch.long))  # fmt: skip
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", VIEWS)
+def test_no_boxes_and_boxes_that_the_lens_does_not_see(name):
+    lens, images = LENSES["beyond 90°"], torch.zeros(1, 3, *SIZE)
+    size = SIZE if name == "none" else (64, 64)
+    corner = torch.tensor([[-50.0, -50.0, -40.0, -40.0], [math.nan] * 4])
+    for boxes in (torch.zeros(0, 4), corner[:0] if name == "none" else corner):
+        tiles = 5 if name == "tiles" else 1
+        detector = LensAdapter(
+            _Constant(boxes), view=make_view(name, size), boxes=lambda out, n=tiles: [out] * n
+        )
+        found = detector(images, lens)
+        assert len(found) == 1 and found[0]["boxes"].shape == (0, 4)
+        assert found[0]["scores"].shape == (0,)
+
+
+def test_detections_that_do_not_fit_are_refused():
+    lens, images = LENSES["radial"], torch.zeros(1, 3, *SIZE)
+    network = _Constant(torch.zeros(1, 4))
+    with pytest.raises(ValueError, match="for all 5 tiles of each image, got 1 results"):
+        LensAdapter(network, 64, view="tiles")(images, lens)
+    with pytest.raises(ValueError, match="a polar image"):
+        LensAdapter(network, 64, view="polar")(images, lens)
+
+
+@torch.no_grad()
+def test_prepared_lenses_and_one_for_each_image():
+    both = Spherical.from_fov([0.3, 0.9], 2.8, 120.0)
+    images = torch.cat([disks(both[k])[0] for k in range(2)])
+    detector = LensAdapter(Disks("list"), 384, view="mercator")
+    together = detector.run(images, detector.prepare(both, SIZE))
+    for k, found in enumerate(together):
+        (alone,) = detector(images[k : k + 1], both[k])
+        torch.testing.assert_close(found, alone)
