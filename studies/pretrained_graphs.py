@@ -233,7 +233,8 @@ def best(boxes: Tensor, scores: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
     stays = torch.ones_like(scores)
     for _ in range(8):
         stays = ((covers @ stays[..., None])[..., 0] < 0.5).to(scores.dtype)
-    return boxes, scores * stays, labels
+    scores, order = (scores * stays).topk(FOUND, 1)
+    return boxes.gather(1, order[..., None].expand(-1, -1, 4)), scores, labels.gather(1, order)
 
 
 def cells(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -246,18 +247,18 @@ def cells(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CenterNet(nn.Module):
-    """MobileNetV3-CenterNet of 80 COCO classes; images are 0 … 255, RGB, (B, 3, H, W).
+    """MobileNetV3-CenterNet of 80 COCO classes; images are RGB, (B, 3, H, W), normalised by `mean` and `std`.
 
     A detection is a cell whose score is the highest of its 3 × 3 neighbours. The map of sizes gives
     the distances from the cell's place to the four sides of its box.
     """
 
-    mean, std = (0.0, 0.0, 0.0), (1 / 255, 1 / 255, 1 / 255)  # of images 0 … 1
+    mean, std = (0.0, 0.0, 0.0), (1 / 255, 1 / 255, 1 / 255)  # pixels are 0 … 255
+    side = 512
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self.body = Graph(folder / "centernet.json", ["tower_0/keypoints", "tower_0/wh"])
-        self.side = 512
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         heat, sides = (x.permute(0, 3, 1, 2) for x in self.body(images.permute(0, 2, 3, 1)))
@@ -273,13 +274,14 @@ class CenterNet(nn.Module):
 
 
 class NanoDet(nn.Module):
-    """NanoDet of 80 COCO classes; images are normalised, (B, 3, H, W).
+    """NanoDet of 80 COCO classes; images are RGB, (B, 3, H, W), normalised by `mean` and `std`.
 
     Each cell has a score for each class and, for each side of a box, a distribution over 11
     distances, whose mean counts in cells.
     """
 
-    mean, std = (0.406, 0.456, 0.485), (0.225, 0.224, 0.229)
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    side = 416
     strides = 8, 16, 32
 
     def __init__(self, folder: Path) -> None:
@@ -288,10 +290,9 @@ class NanoDet(nn.Module):
         outputs = [f"{name}Sigmoid_{k}" for k in (154, 165, 176)]
         outputs += [f"{name}Split_{k}:1" for k in (153, 164, 175)]
         self.body = Graph(folder / "nanodet.json", outputs)
-        self.side = 416
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        maps = self.body(images)
+        maps = self.body(images.flip(1))  # it was trained with BGR
         boxes, scores = [], []
         for score, sides, stride in zip(maps[:3], maps[3:], self.strides, strict=True):
             columns, rows = (stride * (of + 0.5) for of in cells(score))

@@ -123,7 +123,7 @@ LEVEL = np.eye(3)
 DOWN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-@dataclass
+@dataclass(eq=False)
 class Thing:
     """A photograph in the world."""
 
