@@ -6,7 +6,7 @@ Every lens is a batch, is differentiable in its parameters, and works beyond 90Â
 from darswin.lens.base import MODELS, Lens, from_dict, to_dict
 from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
-from darswin.lens.files.load import load, load_all, save
+from darswin.lens.files.load import load, load_all, load_up, save
 from darswin.lens.fitting import Fit, fit
 from darswin.lens.ideal import (
     Equidistant,
@@ -27,5 +27,6 @@ __all__ = [
     "FieldOfView", "Fisheye624", "Fit", "ImplausibleLens", "KannalaBrandt", "Lens", "Mei", "Number",
     "OCam", "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical",
     "Stereographic", "Tabulated", "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load",
-    "load_all", "pixel_rays", "reproject", "save", "solid_angles", "to_dict", "z_to_distance",
+    "load_all", "load_up", "pixel_rays", "reproject", "save", "solid_angles", "to_dict",
+    "z_to_distance",
 ]  # fmt: skip

@@ -33,11 +33,11 @@ from darswin.views.stereographic import StereographicView
 # angle of the others from the middle, their first azimuth, and the field of view of a tile.
 _LAYOUTS = {
     4: (False, 50, 0, 100),
-    5: (True, 60, 0, 100),
-    6: (True, 60, -90, 90),
-    7: (True, 60, -90, 85),
+    5: (True, 60, 0, 85),
+    6: (True, 60, -90, 85),
+    7: (True, 60, 0, 80),
     8: (True, 60, -90, 80),
-    9: (True, 60, 0, 80),
+    9: (True, 65, 0, 80),
 }
 _WHOLE = math.radians(165)  # for wider lenses, tiles that look farther aside found no more
 

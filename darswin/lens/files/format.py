@@ -70,6 +70,10 @@ class Format:
         """The cameras of a file; `file` is its `Fields`, or the rows of a table."""
         raise NotImplementedError
 
+    def up(self, file: Any) -> list[float]:
+        """The direction away from gravity in the camera's frame, by the file's extrinsics."""
+        raise ValueError(f"{self.name} files do not say which way is up in the camera's frame")
+
     def write(self, lens: Lens, suffix: str) -> str:
         """The text of a file with this suffix; ValueError if the format cannot hold the lens."""
         camera = intrinsics_of(lens, self.origin)

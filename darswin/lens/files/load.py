@@ -94,6 +94,22 @@ def load_all(
     return Calibration.read(path, coefficients).lenses(theta_max, image_size, dtype)
 
 
+def load_up(path: str | os.PathLike) -> tuple[float, float, float]:
+    """Reads the direction away from gravity in a camera's frame, for the argument `up` of views.
+
+    WoodScape's and SynWoodScape's files say it, for a vehicle that stands level. See
+    `darswin.views.up_of` for the extrinsics of other files.
+
+    Returns:
+        The unit vector (x, y, z), with x right, y down and z forward.
+
+    Raises:
+        ValueError: another format, or extrinsics that are missing or wrong.
+        OSError: the file cannot be opened.
+    """
+    return Calibration.read(path).up()
+
+
 def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
     """Writes one lens to a file that `load` reads, and returns the name of the format.
 
@@ -143,6 +159,7 @@ class Calibration:
                     "coefficients", repr(coefficients), known, f"one of {', '.join(opencv.MODELS)}"
                 )
             fields = content if isinstance(content, list) else Fields(content)
+            self._fields = fields
             self._cameras = self.format.cameras(fields, coefficients)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
@@ -161,6 +178,12 @@ class Calibration:
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, coefficients)
+
+    def up(self) -> tuple[float, float, float]:
+        """The result of `load_up`."""
+        with self._about():
+            x, y, z = self.format.up(self._fields)
+        return x, y, z
 
     def has_several(self) -> bool:
         """True if its cameras are not all the same."""

@@ -1,5 +1,6 @@
 """WoodScape's and SynWoodScape's JSON: `intrinsic` holds a polynomial of the angle."""
 
+import math
 from collections.abc import Mapping
 
 from darswin.lens.files.content import Content
@@ -26,6 +27,15 @@ class WoodScape(Format):
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
+
+    def up(self, file: Fields) -> list[float]:
+        # The quaternion turns vectors of the camera to the vehicle's frame, whose z axis is up.
+        x, y, z, w = file.section("extrinsic").numbers("quaternion", (4,))
+        length = math.hypot(x, y, z, w)
+        if not length > 0:
+            raise ValueError("extrinsic.quaternion must not be zero")
+        x, y, z, w = (value / length for value in (x, y, z, w))
+        return [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
 
 
 def _camera(file: Fields) -> Description:
