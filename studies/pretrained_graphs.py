@@ -239,18 +239,17 @@ def best(boxes: Tensor, scores: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
 
 def cells(x: Tensor) -> tuple[Tensor, Tensor]:
     """Columns and rows (H·W,) of the cells of maps (B, C, H, W)."""
-    height, width = x.shape[2:]
-    rows, columns = torch.arange(height * width, device=x.device).div(
-        width, rounding_mode="floor"
-    ), torch.arange(height * width, device=x.device).remainder(width)
-    return columns.to(x.dtype), rows.to(x.dtype)
+    rows, columns = (torch.arange(side, dtype=x.dtype, device=x.device) for side in x.shape[2:])
+    columns, rows = torch.meshgrid(columns, rows, indexing="xy")
+    return columns.flatten(), rows.flatten()
 
 
 class CenterNet(nn.Module):
-    """MobileNetV3-CenterNet of 80 COCO classes; images are RGB, (B, 3, H, W), normalised by `mean` and `std`.
+    """MobileNetV3-CenterNet of 80 COCO classes.
 
-    A detection is a cell whose score is the highest of its 3 × 3 neighbours. The map of sizes gives
-    the distances from the cell's place to the four sides of its box.
+    Images are RGB, (B, 3, H, W), normalised by `mean` and `std`. A detection is a cell whose score
+    is the highest of its 3 × 3 neighbours. The map of sizes gives the distances from the cell's
+    place to the four sides of its box.
     """
 
     mean, std = (0.0, 0.0, 0.0), (1 / 255, 1 / 255, 1 / 255)  # pixels are 0 … 255
@@ -274,10 +273,10 @@ class CenterNet(nn.Module):
 
 
 class NanoDet(nn.Module):
-    """NanoDet of 80 COCO classes; images are RGB, (B, 3, H, W), normalised by `mean` and `std`.
+    """NanoDet of 80 COCO classes.
 
-    Each cell has a score for each class and, for each side of a box, a distribution over 11
-    distances, whose mean counts in cells.
+    Images are RGB, (B, 3, H, W), normalised by `mean` and `std`. Each cell has a score for each
+    class and, for each side of a box, a distribution over 11 distances, whose mean counts in cells.
     """
 
     mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -299,7 +298,8 @@ class NanoDet(nn.Module):
             steps = torch.arange(11, dtype=score.dtype, device=score.device)
             sides = (sides.flatten(2).unflatten(1, (4, 11)).softmax(2) * steps[:, None]).sum(2)
             left, top, right, bottom = (stride * sides).unbind(1)
-            boxes.append(torch.stack((columns - left, rows - top, columns + right, rows + bottom), -1))
+            sides = columns - left, rows - top, columns + right, rows + bottom
+            boxes.append(torch.stack(sides, -1))
             scores.append(score.flatten(2).transpose(1, 2))
         scores = torch.cat(scores, 1)
         best_scores, order = scores.flatten(1).topk(5 * FOUND, 1)

@@ -50,7 +50,11 @@ def ring(count: int, theta_deg: float, fov_deg: float, **others: Any) -> Look:
     """Tiles around the axis of a camera that looks down, without one in the middle."""
     theta, turn = math.radians(theta_deg), 2 * math.pi / count
     around = [
-        (math.sin(theta) * math.cos(k * turn), math.sin(theta) * math.sin(k * turn), math.cos(theta))
+        (
+            math.sin(theta) * math.cos(k * turn),
+            math.sin(theta) * math.sin(k * turn),
+            math.cos(theta),
+        )
         for k in range(count)
     ]
     return Look("tiles", options=dict(directions=around, tile_fov=math.radians(fov_deg)), **others)
@@ -97,7 +101,8 @@ DOWN_METHODS = {
 LEVEL_METHODS = ONE_RUN | SMALL_TILES | LARGE | TILES | MIXED | CONTROLS
 FEW = ("raw", "concentric square", "equirectangular", "stereographic", "mercator")
 SMALL_METHODS = {name: LEVEL_METHODS[name] for name in (
-    *FEW, "raw, 1024²", "mercator, 1024²", "tiles: 4", "tiles: 5", "tiles: 9", "tiles: 5, wrong lens",
+    *FEW, "raw, 1024²", "mercator, 1024²", "tiles: 4", "tiles: 5", "tiles: 9",
+    "tiles: 5, wrong lens",
 )}  # fmt: skip
 SECOND_METHODS = {name: LEVEL_METHODS[name] for name in (
     *FEW, "cylindrical", "tiles: 4", "tiles: 5", "tiles: 9", "tiles: 5, wrong lens",
@@ -164,7 +169,7 @@ def told_lens(name: str, wrong: bool) -> Lens:
     return spherical(*WRONG[name]) if wrong else LENSES[name]()
 
 
-@lru_cache(64)  # the looks of one lens
+@lru_cache(2)  # plans of many pixels take much memory
 def _sampler(
     view: str, size: tuple[int, int], options: str, lens: str, wrong: bool,
     mean: tuple[float, ...], std: tuple[float, ...],
@@ -216,7 +221,11 @@ def merged(parts: list[Found]) -> Found:
 
 def look_file(folder: Path, look: Look, detector: Detector) -> Path:
     """The file that keeps the detections of a look of a scene."""
-    text = json.dumps([detector.name, asdict(look)], sort_keys=True)
+    told = [detector.name, asdict(look)]
+    if look.view == "tiles":  # what "count" means may change
+        parts = make_view("tiles", look.size, **look.options).tiles
+        told += [[tile.direction, tile.fov] for tile in parts]
+    text = json.dumps(told, sort_keys=True)
     return folder / f"{look.view}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from pretrained_files import PANORAMAS, VIDEO, Files
+from pretrained_files import PANORAMAS, Files
 
 from darswin.lens import DoubleSphere, KannalaBrandt, Lens, Perspective, Spherical
 
@@ -25,7 +25,8 @@ FLAT = 512  # px, of the flat pictures around each thing, of 90°
 # The classes of COCO that have photographs among the stamps, and those photographs.
 CLASSES = {
     "person": "people/fireman200b people/fireman240a",
-    "car": "vehicles/auto/beetle vehicles/auto/sedan vehicles/auto/sportscar2 vehicles/race/indycar",
+    "car": "vehicles/auto/beetle vehicles/auto/sedan vehicles/auto/sportscar2 "
+    "vehicles/race/indycar",
     "airplane": "vehicles/flight/planes/747 military/vehicles/f22_raptor",
     "bus": "vehicles/masstransit/green_korean_bus",
     "truck": "vehicles/auto/truck vehicles/emergency/firetruck vehicles/garbagetruck",
@@ -63,7 +64,7 @@ CLASSES = {
     "teddy bear": "animals/mammals/bears/toys/edward_bear",
 }
 # The 80 classes of COCO in the order of the detectors' outputs.
-COCO = (
+_NAMES = (
     "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,"
     "stop sign,parking meter,bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,"
     "backpack,umbrella,handbag,tie,suitcase,frisbee,skis,snowboard,sports ball,kite,baseball bat,"
@@ -71,7 +72,8 @@ COCO = (
     "banana,apple,sandwich,orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,"
     "potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,cell phone,microwave,"
     "oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush"
-).split(",")
+)
+COCO = _NAMES.split(",")
 
 
 def filling(lens: Lens, fov_deg: float) -> Lens:
@@ -159,7 +161,9 @@ class Billboard:
 
     def paint(self, picture: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Paints over a picture (P, 3) of rays (P, 3); returns the pixels of its mask."""
-        near = np.flatnonzero(rays @ self.direction.astype(rays.dtype) > math.cos(self.radius + 0.02))
+        near = np.flatnonzero(
+            rays @ self.direction.astype(rays.dtype) > math.cos(self.radius + 0.02)
+        )
         seen = rays[near]
         plane = seen @ np.stack((self.right, self.down), 1) / (seen @ self.direction)[:, None]
         sides = np.array(self.image.shape[1::-1])
@@ -215,8 +219,8 @@ class Scene:
             stamp = str(rng.choice(CLASSES[label].split()))
             theta, phi = math.radians(rng.uniform(*kind.thetas)), rng.uniform(0, 2 * math.pi)
             size = math.radians(rng.uniform(*kind.sizes))
-            middle = np.array([math.cos(phi), math.sin(phi), 0]) * math.sin(theta)
-            thing = Thing(label, stamp, middle + [0, 0, math.cos(theta)], size)
+            x, y = math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi)
+            thing = Thing(label, stamp, np.array([x, y, math.cos(theta)]), size)
             if abs(thing.direction @ self.up) > math.sin(math.radians(85)):
                 continue  # it would lie
             board = self.board(thing)
