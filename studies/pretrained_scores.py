@@ -36,7 +36,7 @@ def match(found: Found, things: Sequence[Thing]) -> tuple[np.ndarray, np.ndarray
     """
     order = np.argsort(-found.scores, kind="stable")
     hits = np.full(len(order), -1)
-    truth = np.stack([thing.box for thing in things])
+    truth = np.array([thing.box for thing in things], float).reshape(-1, 4)
     labels = np.array([COCO.index(thing.label) for thing in things])
     overlaps = boxes.iou(found.boxes[order].astype(float), truth)
     free = np.ones(len(things), bool)
@@ -62,8 +62,8 @@ def rows_of(found: Sequence[Found], things: Sequence[Sequence[Thing]]) -> Rows:
     return Rows(
         scene[order], score[order], label[order], hit[order], score[order] >= SURE,
         np.repeat(np.arange(len(things)), [len(of) for of in things]),
-        np.array([COCO.index(thing.label) for of in things for thing in of]),
-        np.array(thing_found),
+        np.array([COCO.index(thing.label) for of in things for thing in of], int),
+        np.array(thing_found, bool),
     )  # fmt: skip
 
 
@@ -90,8 +90,8 @@ def scores(rows: Rows, weights: np.ndarray) -> dict[str, float]:
             means.append(average_precision(rows.hit[own], of_row[own], things))
     sure = of_row * rows.sure
     return dict(
-        map=float(np.mean(means)),
-        recall=float((of_thing * rows.thing_found).sum() / of_thing.sum()),
+        map=float(np.mean(means)) if means else 0.0,
+        recall=float((of_thing * rows.thing_found).sum() / max(of_thing.sum(), 1e-12)),
         precision=float((sure * rows.hit).sum() / max(sure.sum(), 1e-12)),
         false=float((sure * ~rows.hit).sum() / weights.sum()),
     )
@@ -135,8 +135,9 @@ class Resampled:
         ]  # fmt: skip
         if found_flat is not None:
             own = self.rows.thing_found
-            kept["of_flat"] = round(float(own.sum() / max(found_flat.sum(), 1)), 4)
-            kept["same_as_flat"] = round(float(own[found_flat].mean()), 4)
+            flat = max(found_flat.sum(), 1)
+            kept["of_flat"] = round(float(own.sum() / flat), 4)
+            kept["same_as_flat"] = round(float((own & found_flat).sum() / flat), 4)
         return kept
 
 
