@@ -116,7 +116,7 @@ learned-lens: build  ## find unknown lenses by gradient descent (ten minutes; ca
 worlds: build  ## render pictures, labels and distances of a game's worlds (3 minutes; needs `apt-get install freedoom`)
 	$(BIN)/python studies/render_worlds.py --out out/worlds
 
-study-dense: build  ## study labels and distances through unknown lenses (2 hours; can be interrupted)
+study-dense: build  ## study labels and distances through unknown lenses (5 hours; can be interrupted)
 	$(BIN)/python studies/dense.py
 
 study-sizes: build  ## study distances that only the lens and the size of balls reveal (half an hour; can be interrupted)

@@ -12,33 +12,30 @@ the corners are mostly empty, so a rectangle would grow with every step.
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    Array = np.ndarray | Tensor
-
 __all__ = [
-    "SphericalBoxes", "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "cut_polygon",
-    "decode_rle", "encode_rle", "iou", "merge", "spherical",
+    "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "decode_rle", "encode_rle",
+    "iou", "merge", "spherical",
 ]  # fmt: skip
 
+Array = Any  # a NumPy array, a tensor, or lists of numbers
 PointMap = Callable[[np.ndarray], np.ndarray]
 
 _ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-# The points of the ellipse inside the box (0, 0, 1, 1), (72, 2).
-_ELLIPSE = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), -1) / 2 + 0.5
+# The points of the ellipse inside a box are the product of the box and this matrix, (4, 144).
+_SHARES = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), -1)[..., None] / 2 + 0.5
+_ELLIPSE = np.concatenate(((1 - _SHARES) * np.eye(2), _SHARES * np.eye(2)), -1).reshape(144, 4).T
 _STEP = 4.0  # px: a curve differs less than 0.1 px from its chords, if its radius is above 20 px
-_ROWS = 512  # boxes that are compared with all others at once, to bound the memory
+_ROWS = 128  # boxes that are compared with all worse ones at once
 
 
 # -- through a map of points --------------------------------------------------------------------
 
 
-def carry(boxes: "Array", points_map: PointMap) -> tuple[Any, Any]:
+def carry(boxes: Array, points_map: PointMap) -> tuple[Any, Any]:
     """Carries boxes through a point map, by the ellipses inside them.
 
     Args:
@@ -51,13 +48,22 @@ def carry(boxes: "Array", points_map: PointMap) -> tuple[Any, Any]:
     Raises:
         ValueError: boxes of another shape.
     """
-    found = _through(points_map, _ellipses(boxes))
-    visible = np.isfinite(found[..., 0]).mean(1)
-    carried = np.concatenate((np.fmin.reduce(found, axis=1), np.fmax.reduce(found, axis=1)), 1)
+    # Reductions along a contiguous axis are several times as fast.
+    found = np.ascontiguousarray(np.moveaxis(_through(points_map, ellipses(boxes)), -1, 0))
+    unseen = np.isnan(found)
+    low, high = np.where(unseen, np.inf, found).min(2), np.where(unseen, -np.inf, found).max(2)
+    visible = 1 - unseen[0].mean(1)
+    carried = np.where(visible[:, None] > 0, np.concatenate((low, high)).T, np.nan)
     return _like(boxes, carried), _like(boxes, visible)
 
 
-def carry_points(points: "Array", points_map: PointMap) -> Any:
+def ellipses(boxes: Array) -> np.ndarray:
+    """The points of the ellipses inside boxes, (K, 72, 2); NaN for boxes that are not finite."""
+    table = _table(boxes)
+    return (np.where(np.isfinite(table), table, np.nan) @ _ELLIPSE).reshape(-1, 72, 2)
+
+
+def carry_points(points: Array, points_map: PointMap) -> Any:
     """Carries points (..., 2) through a point map; NaN where nothing is seen."""
     table = _floats(points)
     if table.shape[-1:] != (2,):
@@ -65,7 +71,7 @@ def carry_points(points: "Array", points_map: PointMap) -> Any:
     return _like(points, _through(points_map, table))
 
 
-def carry_polygon(polygon: "Array", points_map: PointMap, step: float = _STEP) -> Any:
+def carry_polygon(polygon: Array, points_map: PointMap, step: float = _STEP) -> Any:
     """Carries a polygon (P, 2) through a point map, its sides cut into pieces of at most `step` px.
 
     Returns:
@@ -80,7 +86,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
     if polygon.ndim != 2 or polygon.shape[1] != 2:
         raise ValueError(f"a polygon must have shape (P, 2), got {_shape(polygon)}")
     if not step > 0:
-        raise ValueError(f"`step` must be above 0 px, got {step}")
+        raise ValueError(f"step must be above 0 px, got {step}")
     sides = np.roll(polygon, -1, 0) - polygon
     lengths = np.nan_to_num(np.hypot(*sides.T), posinf=0)  # a side to nowhere stays as it is
     pieces = np.maximum(np.ceil(lengths / step), 1).astype(int)
@@ -90,7 +96,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
     return np.where(share > 0, polygon[side] + share * sides[side], polygon[side])
 
 
-def carry_mask(mask: "Array", to_old: PointMap, size: tuple[int, int]) -> Any:
+def carry_mask(mask: Array, to_old: PointMap, size: tuple[int, int]) -> Any:
     """Carries a mask: each new pixel has the value of the nearest old one, or 0 beyond.
 
     Args:
@@ -112,13 +118,13 @@ def carry_mask(mask: "Array", to_old: PointMap, size: tuple[int, int]) -> Any:
 # -- in a picture -------------------------------------------------------------------------------
 
 
-def clip(boxes: "Array", size: tuple[int, int]) -> Any:
+def clip(boxes: Array, size: tuple[int, int]) -> Any:
     """Cuts boxes (K, 4) at the borders of a picture of (H, W); NaN stays NaN."""
     height, width = size
     return _like(boxes, np.clip(_table(boxes), 0.0, [width, height, width, height]))
 
 
-def iou(boxes: "Array", others: "Array") -> Any:
+def iou(boxes: Array, others: Array) -> Any:
     """The intersection over the union of each box (K, 4) with each of the others (L, 4): (K, L),
     0 for boxes that are NaN or have no area."""
     a, b = _table(boxes)[:, None], _table(others)[None]
@@ -127,7 +133,7 @@ def iou(boxes: "Array", others: "Array") -> Any:
 
 
 def merge(
-    boxes: "Array", scores: "Array", labels: "Array", *, iou: float = 0.5, inside: float = 0.7
+    boxes: Array, scores: Array, labels: Array, *, iou: float = 0.5, inside: float = 0.7
 ) -> Any:
     """Merges the detections of several views of one picture.
 
@@ -146,7 +152,7 @@ def merge(
     """
     for name, limit in (("iou", iou), ("inside", inside)):
         if not 0 <= limit <= 1:
-            raise ValueError(f"`{name}` must be in [0, 1], got {limit}")
+            raise ValueError(f"{name} must be in [0, 1], got {limit}")
     table, score, label = _table(boxes), _floats(scores), np.asarray(_numpy(labels))
     for name, given in (("scores", score), ("labels", label)):
         if given.shape != (len(table),):
@@ -157,12 +163,15 @@ def merge(
     order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
     table, label = table[order], label[order]
     area, kept = _area(table), np.ones(len(order), bool)
+    x0, x1 = np.ascontiguousarray(table[:, ::2].T)
     for start in range(0, len(order), _ROWS):
-        block = label[start : start + _ROWS]
-        better, worse = np.nonzero(np.triu(block[:, None] == label[start:], 1))
-        better, worse = better + start, worse + start
-        both = kept[better] & kept[worse]
-        better, worse = better[both], worse[both]
+        one, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
+        meet = label[one] == label[rest]
+        meet &= x0[one] < x1[rest]
+        meet &= x1[one] > x0[rest]
+        better, worse = np.nonzero(meet)
+        ahead = better < worse
+        better, worse = better[ahead] + start, worse[ahead] + start
         common = _common(table[better], table[worse])
         drops = _ratio(common, area[better] + area[worse] - common) > iou
         drops |= _ratio(common, area[worse]) > inside
@@ -179,15 +188,7 @@ def merge(
 
 
 class SphericalBoxes(NamedTuple):
-    """Boxes as a camera sees them that looks at their middles, level with the camera's frame.
-
-    Attributes:
-        azimuth, elevation: (K,) rad, of the middle: to the right and up, from the optical axis.
-        width, height: (K,) rad, the horizontal and the vertical angle of view.
-        ray: (K, 3), the unit vector of the middle in the camera's frame (x right, y down, z
-            forward).
-        solid_angle: (K,) sr, of the rectangle in that view.
-    """
+    """The result of `spherical`."""
 
     azimuth: Any
     elevation: Any
@@ -197,14 +198,21 @@ class SphericalBoxes(NamedTuple):
     solid_angle: Any
 
 
-def spherical(boxes: "Array", to_rays: PointMap) -> SphericalBoxes:
+def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     """Boxes (K, 4) of a picture as directions and angles, by the ellipses inside them.
 
     Args:
         to_rays: a function from points (..., 2), in darswin's pixels, to rays (..., 3), NaN or 0
             where nothing is seen. Only the seen points count; without any, all is NaN.
+
+    Returns:
+        A named tuple of the boxes as a camera sees them that looks at their middles, level with the
+        camera's frame: azimuth and elevation of the middles (K,) rad, to the right and up from the
+        optical axis; width and height (K,) rad, the horizontal and the vertical angle of view; ray
+        (K, 3), the unit vectors of the middles in the camera's frame (x right, y down, z forward);
+        and solid_angle (K,) sr, of the rectangle in that view.
     """
-    rays = np.asarray(to_rays(_ellipses(boxes) - 0.5), np.float64)
+    rays = np.asarray(to_rays(ellipses(boxes) - 0.5), np.float64)
     length = np.linalg.norm(rays, axis=-1, keepdims=True)
     rays = np.divide(rays, length, out=np.full(rays.shape, np.nan), where=length > 0)
     ray = np.nan_to_num(rays).sum(1)
@@ -239,7 +247,7 @@ def _looking(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 # -- COCO's run-length encoding -------------------------------------------------------------------
 
 
-def encode_rle(mask: "Array", *, compressed: bool = True) -> dict[str, Any]:
+def encode_rle(mask: Array, *, compressed: bool = True) -> dict[str, Any]:
     """A mask (H, W) in COCO's run-length encoding: {"size": [H, W], "counts": text, or a list of
     numbers unless `compressed`}.
 
@@ -342,13 +350,6 @@ def _table(boxes: Any) -> np.ndarray:
     return table
 
 
-def _ellipses(boxes: Any) -> np.ndarray:
-    """The points of the ellipses inside boxes, (K, 72, 2); NaN for boxes that are not finite."""
-    table = _table(boxes)
-    table = np.where(np.isfinite(table), table, np.nan)[:, None]
-    return table[..., :2] + (table[..., 2:] - table[..., :2]) * _ELLIPSE
-
-
 def _shape(array: np.ndarray) -> str:
     return str(tuple(array.shape))
 
@@ -357,17 +358,19 @@ def _through(points_map: PointMap, points: np.ndarray) -> np.ndarray:
     """Points of COCO through a map of darswin's pixels; both coordinates are NaN if one is not
     finite."""
     found = np.asarray(points_map(points - 0.5), np.float64) + 0.5
-    return np.where(np.isfinite(found).all(-1, keepdims=True), found, np.nan)
+    seen = np.isfinite(found[..., 0] + found[..., 1])
+    return found if seen.all() else np.where(seen[..., None], found, np.nan)
 
 
 def _area(boxes: np.ndarray) -> np.ndarray:
-    return np.maximum(boxes[..., 2:] - boxes[..., :2], 0).prod(-1)
+    return _common(boxes, boxes)
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The area of the intersection of boxes."""
     low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
-    return np.maximum(high - low, 0).prod(-1)
+    sides = np.maximum(high - low, 0)
+    return sides[..., 0] * sides[..., 1]  # several times as fast as `prod`
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:

@@ -5,10 +5,10 @@ results, so a study that was stopped can go on. The pictures are rendered once b
 `dense_data.py`. `dense_tables.py` makes the tables and figures. Run it with `make study-dense`,
 which needs `apt-get install freedoom`.
 
-The study has 40 cells: 4 models × 2 seeds × (2 tasks × 2 bands), and 8 controls. A cell trains on
+The study has 72 cells: 8 models × 2 seeds × (2 tasks × 2 bands), and 8 controls. A cell trains on
 8,000 pictures and tests on 24 sets of 75 pictures. It takes 6 to 9 minutes on a core, with another
-cell on the other core. The pictures take 1,900 s, so two cores need 3 hours in total. With
-`--known RECORD` a later run goes on from a record.
+cell on the other core. The pictures take 1,900 s, so two cores need 5 hours in total. With
+`--known RECORD` a later run goes on from a record, and with `--collect` it needs no pictures.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import dense_data
+import torch
 from dense_bounds import bounds
 from dense_cells import Cell, all_cells
 from dense_pictures import predict
@@ -66,6 +67,7 @@ def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
         seed=cell.seed,
         shuffled=cell.shuffled,
         model=f"{cell.family}_{size}",
+        device=torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         given=given,
         sets={row["data"]: summary(row, cell.task) for row in rows},
         seconds=dict(train=trained - start, test=time.perf_counter() - trained),
@@ -91,15 +93,19 @@ def summary(row: dict, task: str) -> dict:
     return scores(row) | dict(zones=zones) | (dict(iou=classes) if classes else {})
 
 
-def known_cells(file: Path) -> dict[Cell, dict]:
-    """The cells of a record; ValueError for another configuration or other cameras."""
+def known_record(file: Path) -> dict:
+    """A record; ValueError for another configuration or other cameras."""
     record = json.loads(file.read_text())
     if record["config"] != CONFIG.read_text():
         raise ValueError(f"{file} was made with another configuration than {CONFIG}")
     if record["cameras"] != (cameras := list(dense_data.CAMERAS)):
         raise ValueError(f"{file} must have the cameras {cameras}, got {record['cameras']}")
-    names = [field.name for field in fields(Cell)]
-    return {Cell(**{name: cell[name] for name in names}): cell for cell in record["cells"]}
+    return record
+
+
+def cell_of(result: dict) -> Cell:
+    """The cell of a result."""
+    return Cell(**{field.name: result[field.name] for field in fields(Cell)})
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -117,12 +123,14 @@ def main(arguments: list[str] | None = None) -> None:
     args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     cells = [cell for cell in all_cells(args.seeds) if (args.cell or "") in cell.key]
     start = time.perf_counter()
-    bands = {cell.band for cell in cells}
-    dense_data.make(args.out / "data", args.processes, args.pixels, tuple(args.pictures), bands)
-    print(f"pictures after {time.perf_counter() - start:.0f} s")
-    known = known_cells(args.known) if args.known else {}
+    record = known_record(args.known) if args.known else None
+    known = {cell_of(result): result for result in record["cells"]} if record else {}
     if args.collect:
         cells = [c for c in cells if (args.out / args.size / c.key / "cell.json").exists()]
+    else:
+        bands = {cell.band for cell in cells}
+        dense_data.make(args.out / "data", args.processes, args.pixels, tuple(args.pictures), bands)
+        print(f"pictures after {time.perf_counter() - start:.0f} s")
     jobs = [(cell, args.out, args.size, options) for cell in cells if cell not in known]
     results = run_all(run_cell, jobs, args.processes, "cell")
     results += [known[cell] for cell in known if cell not in {job[0] for job in jobs}]
@@ -130,9 +138,14 @@ def main(arguments: list[str] | None = None) -> None:
     if args.cell:
         print(json.dumps(results, indent=1, allow_nan=False))
     else:
-        blind, oracle = trivial(args.out), bounds(args.out)
-        record = collect(results, blind, oracle, CONFIG.read_text(), args.size)
-        publish(record, args.out, args.results)
+        if record:  # its pictures are the same
+            blind, oracle = record["trivial"], record["bounds"]
+        else:
+            blind, oracle = trivial(args.out), bounds(args.out)
+        made = collect(results, blind, oracle, CONFIG.read_text(), args.size)
+        if record and args.collect:  # nothing was run here
+            made["machine"] = record["machine"]
+        publish(made, args.out, args.results)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The cells of the dense study: a model, its task and the lenses on which it is trained."""
 
+import json
 from dataclasses import dataclass
 
 from dense_data import SHUFFLED
@@ -8,6 +9,17 @@ from jobs import key_of
 # Training shows every picture as a lens of any ξ would have seen it.
 THROUGH_ANY = ("--data.lens_augmentation", "0..1")
 
+# The same view for all lenses: 4.2 rad (241°) wide, so that it shows all of the pictures of lenses
+# of 165°. It has as many pixels as the picture, to 2 %. Windows divide the maps of all stages.
+MERCATOR = dict(view="mercator", fov=4.2, size=[144, 112])
+EQUIRECTANGULAR = dict(view="equirectangular", fov=4.2, size=[112, 144])
+
+
+def with_options(**options: object) -> tuple[str, ...]:
+    """The options of `darswin fit` for a model with these options."""
+    return "--model.options", json.dumps(options)
+
+
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "DarSwin-Unet A": ("darswin_unet_a", ()),
     "DarSwin-Unet RA": ("darswin_unet_ra", ()),
@@ -15,11 +27,19 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "Swin-Unet (undis)": ("swin_unet_undis", ()),
     "LensAdapter(Swin-Unet)": ("swin_unet_adapted", ()),
     "U-Net with rays": ("conv_unet", ()),
+    "U-Net, Mercator": ("conv_unet", with_options(**MERCATOR)),
+    "U-Net, equirectangular": ("conv_unet", with_options(**EQUIRECTANGULAR)),
+    "Swin-Unet, Mercator": ("swin_unet", with_options(**MERCATOR, window=[3, 7])),
+    "Swin-Unet, equirectangular": ("swin_unet", with_options(**EQUIRECTANGULAR, window=[7, 3])),
     "LensAdapter, lens augmentation": ("swin_unet_adapted", THROUGH_ANY),
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
 # The models of a new study; the others are in an older record.
-STUDIED_MODELS = ("DarSwin-Unet RA", "U-Net with rays", "LensAdapter(Swin-Unet)", "Swin-Unet")
+STUDIED_MODELS = (
+    "DarSwin-Unet RA", "U-Net with rays", "LensAdapter(Swin-Unet)", "Swin-Unet",
+    "U-Net, Mercator", "U-Net, equirectangular", "Swin-Unet, Mercator",
+    "Swin-Unet, equirectangular",
+)  # fmt: skip
 # Each task and the band of its training.
 STUDIED = (
     ("segmentation", "wide"),

@@ -1,5 +1,6 @@
 """The tables and figures of the dense study, made from the results of its cells."""
 
+import itertools
 import os
 import statistics
 from collections import defaultdict
@@ -47,12 +48,12 @@ def collect(cells: list[dict], trivial: dict, bounds: dict, config: str, size: s
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
-    """Writes a record, with the machine and versions, and draws its figures.
+    """Writes a record, with the machine and versions if it has none, and draws its figures.
 
     Args:
         out: the folder of the cells; existing predictions in it are drawn.
     """
-    write(folder / "dense.json", machine=machine(), **record)
+    write(folder / "dense.json", **(dict(machine=machine()) | record))
     draw_curves(record["cells"], record["trivial"], folder / "dense.png")
     for task in TASKS:
         keys = {label: Cell(label, "low", task).key for label in MODELS}
@@ -240,14 +241,14 @@ def _spread(runs: list[dict] | None, value: Callable[[dict], float]) -> str:
 
 
 def times(cells: list[dict]) -> str:
-    """The duration of the cells, in seconds on one core."""
+    """The duration of the cells, in seconds on one core or on a GPU that several cells share."""
     rows = []
-    for task in TASKS:
-        of_task = [cell["seconds"] for cell in cells if cell["task"] == task]
-        if of_task:
-            train, test = (statistics.mean(s[part] for s in of_task) for part in ("train", "test"))
-            rows.append([task, str(len(of_task)), f"{train:.0f}", f"{test:.0f}"])
-    return markdown(["task", "cells", "training, s", "testing, s"], rows)
+    for device, task in itertools.product(sorted({cell["device"] for cell in cells}), TASKS):
+        found = [c["seconds"] for c in cells if (c["device"], c["task"]) == (device, task)]
+        if found:
+            train, test = (statistics.mean(s[part] for s in found) for part in ("train", "test"))
+            rows.append([device, task, str(len(found)), f"{train:.0f}", f"{test:.0f}"])
+    return markdown(["device", "task", "cells", "training, s", "testing, s"], rows)
 
 
 def trials(rows: list[dict], task: str) -> str:

@@ -1,7 +1,6 @@
 """The methods of the sizes study: what a network sees of a picture and of its lens."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,10 +10,8 @@ from torch import Tensor, nn
 
 from darswin import create_model
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map
 from darswin.models import LensAdapter
-from darswin.views import PerspectiveView, SquareView, View
-from darswin.views.base import PixelView
+from darswin.views import make_view
 
 WIDEST = math.radians(96)  # the θ_max of grids with absolute θ, more than that of every test lens
 MEAN, STD = 0.5, 0.25  # of the pixels, for the networks
@@ -27,7 +24,7 @@ class Method:
 
     Attributes:
         model, options: the name and the options for `create_model`.
-        view: the view that the model sees, in `VIEWS`; None means that it takes the pictures.
+        view: the name of the view that the model sees; None means that it takes the pictures.
         scale: the side of the view, in sides of the pictures.
         rays: the viewing direction of each pixel is the input of three more channels.
         absolute: the square or the grid ends at `WIDEST` for every lens, not at θ_max of the lens.
@@ -62,49 +59,11 @@ METHODS = {
 }
 
 
-class Equirectangular(PixelView):
-    """Azimuth and elevation about the optical axis, up to ±`WIDEST`, in equal steps.
-
-    The resolution is the same for all lenses, as in Depth Any Camera (CVPR 2025). The view is 0
-    where a lens sees nothing.
-    """
-
-    size: tuple[int, int]
-
-    def image_points(self, lens: Lens, size: tuple[int, int]) -> Tensor:
-        like = lens.theta_max
-        rows, columns = (torch.arange(s, dtype=like.dtype) for s in self.size)
-        elevation, azimuth = (
-            WIDEST * ((2 * side + 1) / count - 1)
-            for side, count in zip((rows, columns), self.size, strict=True)
-        )
-        elevation, azimuth = torch.meshgrid(elevation, azimuth, indexing="ij")
-        flat = torch.cos(elevation)
-        rays = torch.stack(
-            (flat * torch.sin(azimuth), torch.sin(elevation), flat * torch.cos(azimuth)), -1
-        )
-        points = lens.project_points(rays[None], size)
-        return as_map(torch.where((elevation.abs() > math.pi / 2)[..., None], torch.nan, points))
-
-    def view_points(self, lens: Lens, size: tuple[int, int]) -> Tensor:
-        x, y, z = pixel_directions(lens, size).unbind(-1)
-        angles = torch.stack((torch.atan2(x, z), torch.asin(y.clamp(-1, 1))), -1)
-        sides = torch.tensor(self.size[::-1], dtype=angles.dtype)
-        return as_map(((angles / WIDEST + 1) * sides - 1) / 2)
-
-
 def pixel_directions(lens: Lens, size: tuple[int, int]) -> Tensor:
     """The viewing directions (x, y, z) of the pixels, (N, H, W, 3); NaN where no ray lands."""
     rows, columns = (torch.arange(side, dtype=lens.theta_max.dtype) for side in size)
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
     return lens.unproject_points(pixels[None], size)
-
-
-VIEWS: dict[str, Callable[..., View]] = {
-    "square": SquareView,
-    "perspective": PerspectiveView,
-    "equirectangular": Equirectangular,
-}
 
 
 class Measurer(nn.Module):
@@ -114,13 +73,15 @@ class Measurer(nn.Module):
         super().__init__()
         self.method = method
         edge = dict(theta_max=WIDEST) if method.absolute else {}
+        # The same directions for all lenses, as in Depth Any Camera (CVPR 2025).
+        edge |= dict(fov=2 * WIDEST) if method.view == "equirectangular" else {}
         self.network: nn.Module = create_model(
             method.model, task="distance", in_chans=6 if method.rays else 3,
             typical_distance=TYPICAL, **method.options, **({} if method.view else edge),
         )  # fmt: skip
         if method.view:
             side = round(method.scale * SIZE)
-            view = VIEWS[method.view]((side, side), **edge, mean=None, std=None)
+            view = make_view(method.view, (side, side), **edge, mean=None, std=None)
             self.network = LensAdapter(self.network, view=view)
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:

@@ -1,5 +1,6 @@
 """Examples of every lens model. Tests of all models use them; add a new model here."""
 
+import functools
 import itertools
 import json
 import math
@@ -10,6 +11,7 @@ import torch
 import yaml
 
 from darswin.lens import (
+    MODELS,
     BrownConrady,
     DoubleSphere,
     EnhancedUnified,
@@ -171,6 +173,19 @@ def calibrated(name: str, camera: str | None = None) -> Lens:
 
 
 RANDOM = ("Mei", "KannalaBrandt", "Fisheye624", "BrownConrady", "rational")
+
+
+@functools.cache
+def every_lens() -> dict[str, tuple[Lens, tuple[int, int]]]:
+    """A lens of each model and (H, W) of its images; and those of `ASIDE`."""
+    found = {}
+    for model in sorted(MODELS):
+        lens = example(model, torch.manual_seed(3), (140, 160))[0]
+        found[model] = lens.with_theta_max(min(0.95 * lens.theta_max.item(), 1.7)), (480, 640)
+    for name, lens in ASIDE.items():
+        cx, cy = lens.center[0].tolist()
+        found[f"{name}, off the curve"] = lens, (round(2 * cy), round(2 * cx))
+    return found
 
 
 def random_lens(name: str, seed: int, aside: float = 1.0, count: int = 8) -> Lens:

@@ -20,8 +20,8 @@ FLOORS = (
     ("layers",),
     ("views",),
     ("data",),
-    ("lens",),
-    ("boxes", "ops", "utils"),
+    ("boxes", "lens"),
+    ("ops", "utils"),
 )
 MOST_LINES = 400
 

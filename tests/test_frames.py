@@ -24,8 +24,7 @@ from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
-from darswin.views import PolarView
-from darswin.viz.views import perspective
+from darswin.views import PolarView, make_view
 
 
 def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
@@ -122,6 +121,8 @@ SAMPLING = [
     *((family, dict(features_only=True)) for family in ENCODERS if family not in AS_THEY_ARE),
     ("darswin_unet_a", dict(task="distance")),
     ("swin_unet_undis", dict(task="distance")),
+    ("conv_unet", dict(view="mercator", size=(40, 30))),
+    ("swin_unet", dict(view="equirectangular", fov=2.8)),
 ]
 
 
@@ -189,11 +190,7 @@ def test_no_default_stands_in_for_a_missing_normalization():
         (layer(), dict(std=(0.2, math.nan, 0.2)), "std must be positive"),
         (layer(), dict(std=math.inf), "std of a plan must be finite and above 0"),
         (layer(), dict(mean=(0.2, math.nan, 0.2)), "mean of a plan must be finite"),
-        (
-            torch.ones(4, 5, 3),
-            dict(mean=-math.inf, output="image"),
-            "mean of a plan must be finite",
-        ),
+        (make_view("mercator", (4, 5)), dict(mean=-math.inf), "mean of a plan must be finite"),
         (create_model("darswin_a_nano", in_chans=1), dict(mean=MEAN, std=STD), "per channel"),
         (create_model("darswin_a_nano"), dict(mean=(0.4,), std=(0.2,)), "per channel"),
         (create_model("darswin_a_nano", in_chans=4), {}, "1 mean, or 3 for RGB, got 4"),
@@ -282,8 +279,8 @@ def test_an_out_that_is_no_array_is_named(out):
 
 
 def test_a_view_cannot_be_written_over_its_own_frame():
-    rays = perspective((50, 60), 1.0)
-    sampler, frame = frames.Sampler(frames.plan(rays, ROUND, (50, 60))), random_frame(50, 60, 3)
+    plan = frames.plan(make_view("tangent", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
+    sampler, frame = frames.Sampler(plan), random_frame(50, 60, 3)
     with pytest.raises(ValueError, match="out must not share memory with the frame"):
         sampler(frame, out=frame)
     sampler(frame, out=frame.copy())
@@ -356,9 +353,11 @@ def test_wrong_frames_are_explained(frame, error, words):
         ((layer(), ROUND, 60), {}, TypeError, "size must be a pair of ints"),
         ((layer(), ROUND, (True, 60)), {}, TypeError, "size must be a pair of ints"),
         ((layer(), ROUND, (50, 60)), dict(output="jpeg"), ValueError, "output must be one of"),
-        ((torch.ones(4, 5, 3), ROUND, (50, 60)), dict(output="tokens"), ValueError,
+        ((make_view("mercator", (4, 5)), ROUND, (50, 60)), dict(output="tokens"), ValueError,
          "only a polar grid has tokens"),
-        ((torch.ones(4, 3), ROUND, (50, 60)), {}, ValueError, r"shape \(H, W, 3\)"),
+        ((make_view("mercator", (4, 5), theta_max=0.5, direction=(0, 0, -1)), ROUND, (50, 60)), {},
+         ValueError, "this view sees nothing of the lens"),
+        ((torch.ones(4, 5, 3), ROUND, (50, 60)), {}, TypeError, "a view of darswin, got Tensor"),
         ((torch.nn.Linear(1, 1), ROUND, (50, 60)), {}, TypeError, "got Linear"),
         ((layer(), None, (50, 60)), {}, TypeError, "lens must be"),
     ],

@@ -7,13 +7,18 @@ from pathlib import Path
 import dense
 import dense_data
 import dense_tables
+import numpy as np
 import pytest
+import torch
 from dense_bounds import BOUNDS, bounds
-from dense_cells import CONTROLLED, STUDIED, STUDIED_MODELS, all_cells
+from dense_cells import CONTROLLED, MODELS, STUDIED, STUDIED_MODELS, all_cells
 from dense_trivial import trivial
 from worlds import wad
+from worlds.lenses import draw_lens
 
+from darswin import create_model
 from darswin.data import open_scenes
+from darswin.lens.pixels import pixel_rays
 
 pytestmark = [
     pytest.mark.slow,
@@ -31,8 +36,24 @@ QUICK = """
 def test_cells_have_folders_of_their_own():
     cells = all_cells(3)
     assert len({cell.key for cell in cells}) == len(cells)
-    assert len(cells) == len(STUDIED) * (len(STUDIED_MODELS) * 3 + len(CONTROLLED)) == 56
+    assert len(cells) == len(STUDIED) * (len(STUDIED_MODELS) * 3 + len(CONTROLLED)) == 104
     assert cells[0].key == "darswin-unet-ra-wide-segmentation-0"
+
+
+@pytest.mark.parametrize("label", [label for label in STUDIED_MODELS if ", " in label])
+def test_maps_show_all_of_the_pictures(label):
+    family, (_, options) = MODELS[label]
+    model = create_model(f"{family}_nano", task="distance", **json.loads(options))
+    height, width = model.view.size
+    assert abs(height * width / dense_data.SIZE**2 - 1) < 0.02
+    for name in ("wide", "0", "0.2..0.35", "1"):
+        lens = draw_lens(name, dense_data.SIZE, dense_data.FOV, np.random.default_rng(0))
+        ones = torch.ones(1, 1, height, width)
+        prepared = model.prepare(lens, (dense_data.SIZE,) * 2)
+        rays = pixel_rays(lens, (dense_data.SIZE,) * 2)[0]
+        seen = ~rays.isnan()
+        shown = model.view.back(ones, prepared)[0][seen] > 0.5
+        assert shown.float().mean() > 0.999 and seen.float().mean() > 0.7
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -40,7 +40,6 @@ from darswin.viz.pixels import (
 Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # takes a half to a third of the time of single images
-LENSES = 16  # whose prepared values are kept, for folders whose pictures come from several cameras
 ANSWERS = "predictions.json"
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
@@ -54,33 +53,62 @@ class Request(NamedTuple):
 class Answers:
     """Collects the predictions for images, in their order.
 
+    Args: channels: of the images, 1 or 3.
+    """
+
+    most_lenses = 16  # whose values are kept, for folders whose pictures come from several cameras
+
+    def __init__(self, channels: int):
+        self.channels = channels
+        self.found: list[dict[str, Any]] = []
+        self.seconds = 0.0  # spent in the network
+        self._kept: dict[int, tuple[Lens, Any]] = {}  # by the identity of the lens
+
+    def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
+        """Adds an image (H, W, C) uint8 with its lens. Equal lenses should be the same object."""
+        raise NotImplementedError
+
+    def flush(self) -> None:
+        """Predicts the images that wait."""
+
+    def _once(self, lens: Lens, make: Callable[[], Any]) -> Any:
+        """What `make` makes of a lens, made once for each of the last lenses."""
+        if id(lens) not in self._kept:
+            made = make()
+            if len(self._kept) == self.most_lenses:
+                del self._kept[next(iter(self._kept))]
+            self._kept[id(lens)] = lens, made
+        return self._kept[id(lens)][1]
+
+
+class ModelAnswers(Answers):
+    """Predicts by a model of darswin.
+
     Consecutive images with the same lens form a batch. Values that depend only on the lens are
     computed once.
     """
 
     def __init__(self, model: Encoder | PixelModel, card: ModelCard):
+        super().__init__(model.in_chans)
         self.model, self.card = model, card
-        self.found: list[dict[str, Any]] = []
-        self.seconds = 0.0  # spent in the network
         self._lens: Lens | None = None  # of the queue
-        self._prepared: dict[int, tuple[Lens, Prepared, FullSize | None]] = {}  # by identity
         self._queue: list[Request] = []
         self._warned = False
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
-        """Adds an image (H, W, C) uint8 with its lens. Equal lenses should be the same object."""
         pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
-            self._lens = lens
-            if id(lens) not in self._prepared:
-                if len(self._prepared) == LENSES:
-                    del self._prepared[next(iter(self._prepared))]
+
+            def prepare() -> tuple[Prepared, FullSize | None]:
                 with torch.inference_mode():
                     size = (pixels.shape[2], pixels.shape[3])
                     prepared = self.model.prepare(resized_lens, size)
-                self._prepared[id(lens)] = lens, prepared, self._full_size(lens)
                 self._warn_of_cut_off(lens)
+                return prepared, self._full_size(lens)
+
+            self._prepared: tuple[Prepared, FullSize | None] = self._once(lens, prepare)
+            self._lens = lens
         self._queue.append(Request(entry, image, pixels))
         if len(self._queue) == BATCH:
             self.flush()
@@ -106,7 +134,7 @@ class Answers:
         queue, self._queue = self._queue, []
         if not queue:
             return
-        _, prepared, full = self._prepared[id(self._lens)]
+        prepared, full = self._prepared
         images = torch.cat([request.pixels for request in queue])
         start = time.perf_counter()
         with torch.inference_mode():
@@ -116,12 +144,9 @@ class Answers:
             # Only pixels that a ray reaches have a prediction.
             used = output if full is None else output[:, torch.from_numpy(full.reached)]
             if not used.isfinite().all():
-                entry = request.entry
-                video = entry.get("video")
-                name = f"frame {entry['frame']} of {video}" if video else entry["image"]
                 raise FloatingPointError(
-                    f"no prediction for {name}: the model computes NaN or infinity; its weights "
-                    "may have diverged in training"
+                    f"no prediction for {said(request.entry)}: the model computes NaN or infinity; "
+                    "its weights may have diverged in training"
                 )
             self.found.append(request.entry | self._answer(request, output, full))
 
@@ -137,7 +162,7 @@ class Answers:
         raise NotImplementedError
 
 
-class ClassAnswers(Answers):
+class ClassAnswers(ModelAnswers):
     """Predicts the `top` most probable classes."""
 
     model: Encoder
@@ -156,7 +181,7 @@ class ClassAnswers(Answers):
         return {"top": [{"class": names[k], "probability": value} for k, value in pairs]}
 
 
-class PixelAnswers(Answers):
+class PixelAnswers(ModelAnswers):
     """Writes two files for each image: the predictions for its pixels, and an overlay.
 
     `names` are those of `file_names`.
@@ -177,17 +202,11 @@ class PixelAnswers(Answers):
 
     def _answer(self, request: Request, output: Tensor, full: FullSize) -> dict[str, Any]:
         content, picture, where, summary = self._picture(request, output.float().numpy(), full)
-        entry = request.entry
-        if "video" in entry:
-            name = f"{self.names[entry['video']]}/{entry['frame']:06d}"
-        else:
-            name = self.names[entry["image"]]
-        files = {self.kind: f"{self.kind}/{name}.png", "overlay": f"overlays/{name}.jpg"}
-        replace_file(self.out / files[self.kind], content)
+        name = file_of(request.entry, self.names)
+        file = f"{self.kind}/{name}.png"
+        replace_file(self.out / file, content)
         laid = overlay(request.image, picture, where=where)
-        _, jpeg = cv2.imencode(".jpg", laid[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
-        replace_file(self.out / files["overlay"], jpeg.data)
-        return files | summary
+        return {self.kind: file, "overlay": write_overlay(self.out, name, laid)} | summary
 
     def _picture(
         self, request: Request, output: np.ndarray, full: FullSize
@@ -248,6 +267,25 @@ class DistanceAnswers(PixelAnswers):
 
 
 ANSWERS_OF = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
+
+
+def said(entry: Mapping[str, Any]) -> str:
+    """A picture or a frame in words."""
+    video = entry.get("video")
+    return f"frame {entry['frame']} of {video}" if video else entry["image"]
+
+
+def file_of(entry: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    """The name of the output files of a picture or a frame; names: those of `file_names`."""
+    video = entry.get("video")
+    return f"{names[video]}/{entry['frame']:06d}" if video else names[entry["image"]]
+
+
+def write_overlay(out: Path, name: str, picture: np.ndarray) -> str:
+    """Writes a picture (H, W, 3), RGB, into the folder of overlays; returns its path there."""
+    _, jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    replace_file(out / f"overlays/{name}.jpg", jpeg.data)
+    return f"overlays/{name}.jpg"
 
 
 def fast(model: Net, card: ModelCard) -> Net:

@@ -125,6 +125,8 @@ def _value(text: str, kind: Any) -> Any:
     values = yaml.safe_load(text)
     values = values if isinstance(values, list) else [values]
     fixed = typing.get_origin(kind) is tuple
+    if choices[0] is float:
+        values = [float(str(value)) for value in values]  # YAML takes 1e-3 for a text
     if any(type(value) is not choices[0] for value in values):
         raise ValueError
     if fixed and len(values) != len(choices):
@@ -137,10 +139,13 @@ def _kind(kind: Any) -> str:
     choices = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
         return f"one of {', '.join(choices)}"
-    if typing.get_origin(kind) is tuple:
+    if typing.get_origin(kind) is tuple and choices[0] is int:
         return f"{len(choices)} whole numbers, such as {','.join(['10'] * len(choices))}"
+    if typing.get_origin(kind) is tuple:
+        return f"{len(choices)} numbers, such as {','.join(['0.5'] * len(choices))}"
     if _is_list(kind):
-        return "whole numbers, such as 1,8" if choices[0] is int else "a list of texts"
+        lists = {int: "whole numbers, such as 1,8", float: "numbers, such as 0.5,1"}
+        return lists.get(choices[0], "a list of texts")
     return _WORDS.get(kind, "a text")
 
 

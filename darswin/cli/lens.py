@@ -8,7 +8,7 @@ import torch
 import darswin.lens
 from darswin.cli.arguments import check_out
 from darswin.cli.undistort import undistort
-from darswin.cli.views import View, check_view, view_of, view_rays
+from darswin.cli.views import Look, Up, View
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.files.opencv import Coefficients
@@ -31,8 +31,8 @@ def show(
     calib: str, image: str, *, out: str = "lens.png", rings: int = 16, sectors: int = 64,
     samples: tuple[int, int] = (10, 10), spacing: Spacing = "theta",
     view: View = "perspective", fov_deg: float | None = None, yaw_deg: float = 0.0,
-    pitch_deg: float = 0.0, theta_max_deg: float | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None,
+    pitch_deg: float = 0.0, up: Up | None = None, theta_max_deg: float | None = None,
+    camera: str | None = None, coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Draws a picture with its polar partition, its polar image, and an undistorted view.
 
@@ -46,9 +46,10 @@ def show(
         spacing: the quantity that the rings divide into equal parts.
         view: the projection of the undistorted view.
         fov_deg: the horizontal field of view of the undistorted view, in degrees. The default is
-            all that the picture shows; for a perspective view, 110° at most.
+            all that the picture shows; for a perspective view, 110° at most; for a panorama, 360°.
         yaw_deg: the angle that the undistorted view looks to the right, in degrees.
         pitch_deg: the angle that the undistorted view looks up, in degrees.
+        up: the direction away from gravity, for the undistorted view: see `darswin lens undistort`.
         theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
             largest angle that the picture shows.
         camera: the name or number of the camera, if the file has several.
@@ -61,7 +62,8 @@ def show(
     figure_format(out)
     check_out(out, (calib, image))
     _check_partition(rings, sectors, samples)
-    check_view(view, fov_deg, yaw_deg, pitch_deg)
+    look = Look(view, fov_deg, yaw_deg, pitch_deg, up)
+    look.check()
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     stored = stored_size(size, orientation)
@@ -69,10 +71,9 @@ def show(
     lens = file.lens(camera, theta_max, stored, torch.float64)
     lens = in_upright_picture(lens, size, orientation)
     sampler = PolarView(rings, sectors, samples, spacing=spacing)
-    fov_deg, view_size = view_of(lens, size, view, fov_deg, VIEW_SIDE)
-    rays = view_rays(view, view_size, fov_deg, yaw_deg, pitch_deg)
+    fov_deg, view_size = look.shape(lens, size, VIEW_SIDE)
     title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"
-    save_figure(draw_lens(picture, lens, sampler, rays, title), out)
+    save_figure(draw_lens(picture, lens, sampler, look.make(view_size, fov_deg), title), out)
     print(out)
 
 

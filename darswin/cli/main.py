@@ -44,7 +44,7 @@ COMMANDS = {
     "validate": Command("evaluates a trained model on the validation set", TRAIN, RUN),
     "test": Command("evaluates a trained model on the test set, for each lens", TRAIN, RUN),
     "predict": Command(
-        "predicts classes, or a class or a distance for every pixel",
+        "predicts classes, or a class or a distance for every pixel; or runs any ONNX network",
         PICTURES,
         "darswin.cli.predict:predict",
     ),
@@ -63,6 +63,11 @@ COMMANDS = {
         "draws, describes, converts or crops a calibration, or undistorts pictures and videos",
         PICTURES,
         "darswin.cli.lens:COMMANDS",
+    ),
+    "warp": Command(
+        "writes pictures and labels as another lens or a view sees them",
+        PICTURES,
+        "darswin.cli.warp:warp",
     ),
     "bench": Command(
         "measures the speed of a model on this machine (15 minutes)",

@@ -4,15 +4,16 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
+from darswin.cli.network import NetworkAnswers
 from darswin.cli.options import check_folder
 from darswin.compat import load_official
 from darswin.data.folders import PICTURES, pictures_and_videos_below
@@ -40,9 +41,14 @@ def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
     model: str | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None, task: Task | None = None, top: int = 5,
-    every: int = 1, out: str | None = None,
+    every: int = 1, out: str | None = None, network: str | None = None, view: str | None = None,
+    size: tuple[int, int] | None = None, fov_deg: float | None = None,
+    up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
+    std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
+    threshold: float | None = None, labels: str | None = None,
 ) -> list[dict]:  # fmt: skip
-    """Predicts classes, or a class or a distance for every pixel, of pictures and video frames.
+    """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
+    or runs any network in an ONNX file, such as a detector, on a view of them.
 
     Prints the most probable classes as JSON, or writes picture files. Pictures and videos are
     turned upright by their metadata, and their lens with them. If some files cannot be read, the
@@ -72,18 +78,48 @@ def predict(
         out: the JSON file to write; without it, classes are printed. For segmentation and
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
-            in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
+            in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json. For a
+            network, it gets overlays/NAME.jpg with boxes, or maps/OUTPUT/NAME.npy, and
+            predictions.json; the numbers of a network without boxes and maps are printed.
+        network: in place of a run, an ONNX file of any network. Its outputs are boxes, scores and
+            labels by these names, one output (B, N, 6) of x0, y0, x1, y1, score and class, maps
+            (B, K, H, W), or numbers (B, K). It needs onnxruntime, of the extra onnx.
+        view: what the network sees of the pictures, by its lens: the name of a view of
+            `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
+            The default is mercator.
+        size: height and width of the view in px, such as 512,512, if the network takes any size.
+        fov_deg: the horizontal field of view of the view, in degrees. The default is all that the
+            lens sees.
+        up: the direction away from gravity, as x right, y down and z forward of the camera. The
+            default is the top of the picture, 0,-1,0.
+        mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
+            one for each channel. The default is 0.
+        std: the same for std. The default is 1.
+        channels: the order of colours that the network expects. The default is rgb.
+        threshold: the lowest score of boxes. The default is 0.3.
+        labels: a file with the names of the network's classes, from class 0: a text file with a
+            name in each line, or a JSON list.
     """
-    if run is not None and model is None:
-        check_folder(Path(run))
-        weights: str | Path = model_of_run(run)
-    elif model is not None and run is None:
-        weights = Path(model_file(model))
-    else:
+    options: dict[str, Any] = {
+        "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
+        "channels": channels, "threshold": threshold, "labels": labels,
+    }  # fmt: skip
+    if network is None and (given := [k for k, value in options.items() if value is not None]):
+        raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")
+    if sum(given is not None for given in (run, model, network)) != 1:
         raise ValueError(
             "give either --run, the folder of a run, or --model, a safetensors file or one of "
             + ", ".join(list_pretrained())
+            + ", or --network, an ONNX file"
         )
+    if run is not None:
+        check_folder(Path(run))
+        weights: str | Path = model_of_run(run)
+    elif model is not None:
+        weights = Path(model_file(model))
+    else:
+        assert network is not None
+        weights = network
     for name, value in (("top", top), ("every", every)):
         check(name, value, value >= 1, "at least 1")
     if not paths and lens is None and model in list_pretrained():
@@ -93,10 +129,15 @@ def predict(
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
     check_paths(paths)
-    net, card = trained_model(weights)
-    if task not in (None, card.task):
-        raise ValueError(f"--task is {task}, but {weights} is a model for {card.task}")
-    files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
+    if network is None:
+        kind, make = _of_model(weights, top)
+    else:
+        through = NetworkAnswers(network, **options)
+        kind, make = through.network.kind, through.into
+    if task not in (None, kind):
+        raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
+    prints = kind in ("classification", "numbers")
+    files = pictures_and_videos(paths, leave_out=None if prints else out)
     names = [file.name for file in files]
     check_out(out, [*names, str(weights), *([] if lens is None else [lens])])
     if lens is not None:
@@ -104,12 +145,9 @@ def predict(
     else:
         assert run is not None
         lenses = lenses_of_run(run, camera, coefficients, names)
-    if card.task == "classification":
-        answers: Answers = ClassAnswers(net, card, top)
-    else:
-        folder = claim_folder(out)
-        out = str(folder / ANSWERS)
-        answers = ANSWERS_OF[card.task](net, card, folder, file_names(paths, files))
+    folder = None if prints else claim_folder(out)
+    out = out if folder is None else str(folder / ANSWERS)
+    answers = make(folder, file_names(paths, files))
     bad: list[str] = []
     try:
         for file in files:
@@ -117,7 +155,7 @@ def predict(
                 if file.is_video:
                     answer_video(file.name, every, lenses, answers)
                 else:
-                    image, orientation = read_oriented(file.name, net.in_chans)
+                    image, orientation = read_oriented(file.name, answers.channels)
                     taken_with = _lens(lenses, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
@@ -136,6 +174,20 @@ def predict(
         count = f"no {what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
+
+
+def _of_model(
+    weights: str | Path, top: int
+) -> tuple[str, Callable[[Path | None, Mapping[str, str]], Answers]]:
+    """The task of a model, and what makes its answers, for a folder and the names of files."""
+    net, card = trained_model(weights)
+
+    def make(folder: Path | None, names: Mapping[str, str]) -> Answers:
+        if folder is None:
+            return ClassAnswers(net, card, top)
+        return ANSWERS_OF[card.task](net, card, folder, names)
+
+    return card.task, make
 
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
@@ -173,7 +225,7 @@ def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> Non
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
-        for frame in read_frames(name, answers.model.in_chans, every):
+        for frame in read_frames(name, answers.channels, every):
             taken_with = _lens(lenses, name, frame.image, frame.orientation)
             entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import darswin.lens
-from darswin.cli.views import View, check_view, view_of, view_rays
+from darswin.cli.views import Look, Up, View
 from darswin.lens import Lens, Perspective
 from darswin.lens.files.load import reach
 from darswin.lens.files.opencv import Coefficients
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from darswin.frames import Sampler
 
 MOST_PIXELS = 2**26  # of a view
-WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 RECORD, LENS = "undistorted.json", "lens.json"
 _KEPT = 8  # plans in memory, for pictures of several sizes or cameras
 
@@ -32,8 +31,8 @@ _KEPT = 8  # plans in memory, for pictures of several sizes or cameras
 def undistort(
     calib: str, paths: Sequence[str] = (), *, out: str, view: View = "perspective",
     fov_deg: float | None = None, size: tuple[int, int] | None = None, yaw_deg: float = 0.0,
-    pitch_deg: float = 0.0, theta_max_deg: float | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None,
+    pitch_deg: float = 0.0, up: Up | None = None, theta_max_deg: float | None = None,
+    camera: str | None = None, coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Undistorts pictures and videos of a fisheye or wide-angle camera.
 
@@ -50,16 +49,21 @@ def undistort(
             replaced. Pictures have 8 bits per channel and no transparency, videos have no sound.
             Endings that cannot be written get .png or .mp4 in addition.
         view: the projection. A perspective view shows straight lines straight, but its sides become
-            coarse above 110°. A cylindrical view shows verticals straight. An equirectangular view
-            is a part of a map of the sphere. A square shows the whole image disc, in equal steps of
-            the incident angle.
+            coarse above 110°. A cylindrical view shows verticals straight. Equirectangular and
+            Mercator views are parts of a map of the sphere; in a Mercator view and in a
+            stereographic one things keep their shape. A panorama shows all directions around the
+            vertical, for cameras that look down or up. A square shows the whole image disc, in
+            equal steps of the incident angle.
         fov_deg: the horizontal field of view, in degrees. The default is all that the picture
-            shows; for a perspective view, 110° at most.
+            shows; for a perspective view, 110° at most; for a panorama, 360°.
         size: height and width of the views in px, e.g. 480,640. The default is a shape that fits
             the view, with the longer side of the picture; a square has the shorter one. Videos have
             even sides.
         yaw_deg: the angle that the view looks to the right, in degrees.
         pitch_deg: the angle that the view looks up, in degrees.
+        up: the direction away from gravity, e.g. 0,-1,0: x to the right of the upright picture, y
+            down and z ahead. The verticals of the view follow it. The default is the top of the
+            picture, turned with the view.
         theta_max_deg: the incident angle beyond which the view is black, in degrees. The default is
             that of the calibration file; if it has none, all of the picture is shown.
         camera: the name or number of the camera, if the file has several.
@@ -72,7 +76,8 @@ def undistort(
     from darswin.utils.image import BrokenImageError
     from darswin.utils.progress import Progress
 
-    check_view(view, fov_deg, yaw_deg, pitch_deg)
+    look = Look(view, fov_deg, yaw_deg, pitch_deg, up)
+    look.check()
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
         check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
@@ -92,7 +97,7 @@ def undistort(
         raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of --out")
     folder = claim_folder(out, RECORD)
     (folder / LENS).unlink(missing_ok=True)
-    views = _Views(calibrations, view, fov_deg, size, yaw_deg, pitch_deg, theta_max_deg)
+    views = _Views(calibrations, look, size, theta_max_deg)
     names = relative_names(paths, files)
     bad: list[str] = []
     written: dict[str, Lens | None] = {}
@@ -126,12 +131,11 @@ class _Views:
     """The views of pictures, planned once for each lens."""
 
     def __init__(
-        self, calibrations: "Calibrations", view: View, fov_deg: float | None,
-        size: tuple[int, int] | None, yaw_deg: float, pitch_deg: float,
+        self, calibrations: "Calibrations", look: Look, size: tuple[int, int] | None,
         theta_max_deg: float | None,
     ):  # fmt: skip
-        self._calibrations, self._view, self._fov_deg = calibrations, view, fov_deg
-        self._size, self._turn, self._theta_max_deg = size, (yaw_deg, pitch_deg), theta_max_deg
+        self._calibrations, self._look = calibrations, look
+        self._size, self._theta_max_deg = size, theta_max_deg
         self._plans: dict[tuple[int, bool], _Viewed] = {}
         self._said: set[str] = set()
 
@@ -139,7 +143,7 @@ class _Views:
     def said(self) -> str:
         """The view in words."""
         (shape,) = self._said if len(self._said) == 1 else ("in several sizes",)
-        return f"{self._view} view, {shape}"
+        return f"{self._look.view} view, {shape}"
 
     def of(self, name: str, size: tuple[int, int], orientation: int, even: bool) -> _Viewed:
         """The view of an upright picture of (H, W); `even` makes its sides even."""
@@ -155,44 +159,38 @@ class _Views:
         from darswin.frames import Sampler, plan
 
         exact = lens.to(torch.float64)
-        side = min(size) if self._view == "square" else max(size)
+        side = min(size) if self._look.view == "square" else max(size)
         if self._theta_max_deg is not None:
             exact = exact.with_theta_max(math.radians(self._theta_max_deg))
-        fov_deg, view_size = view_of(exact, size, self._view, self._fov_deg, side)
+        fov_deg, view_size = self._look.shape(exact, size, side)
         height, width = self._size or view_size
         if even:
             height, width = (max(2, n - n % 2) for n in (height, width))
-        rays = view_rays(self._view, (height, width), fov_deg, *self._turn)
+        view = self._look.make((height, width), fov_deg)
         whole = exact.with_theta_max(None)
         # Without a θ_max in the file, the lens ends at the picture's sides, and corners see more.
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
         self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
         camera = None
-        if self._view == "perspective":
+        if self._look.view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
             camera = Perspective.from_fov(fov, width / 2, image_size=(height, width))
             camera = camera.with_theta_max(reach(camera.with_theta_max(None)))
-        return _Viewed(Sampler(plan(rays, exact, size)), lens, camera)
+        return _Viewed(Sampler(plan(view, exact, size, output="uint8")), lens, camera)
 
 
 def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path, Lens | None]:
     """Undistorts a picture; returns its new path and the camera of the view."""
-    import cv2
-
-    from darswin.utils.image import read_header, read_oriented
+    from darswin.utils.image import read_header, read_oriented, write_image, written_as
 
     with warnings.catch_warnings(action="ignore"):  # Pillow's, about what it skips
         channels = read_header(name).channels
     image, orientation = read_oriented(name, channels)
     viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
     picture = viewed.sampler(image)
-    if target.suffix.lower() not in WRITTEN:
-        target = target.with_name(f"{target.name}.png")
-    done, content = cv2.imencode(target.suffix, picture[..., ::-1])
-    if not done:
-        raise OSError(f"OpenCV cannot write {target}")
-    replace_file(target, content.data)
+    target = written_as(target)
+    write_image(target, picture)
     return target, viewed.camera
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 
+from darswin.data.labels.labels import Labels, moved
 from darswin.data.sample import Sample
 from darswin.data.scenes.targets import nothing_of
 from darswin.data.warping import Part, area_resized, picture_size, size_of_part, taken_part
@@ -97,6 +98,11 @@ class Reframing:
         points = min(_MOST_POINTS, most) if scale > 1 else 1
         self._render = render or (points * self.size[0], points * self.size[1])
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether left and right are swapped."""
+        return self._turn.mirrored
+
     def to_new(self, points: np.ndarray) -> np.ndarray:
         """Pixels (x, y) of the old picture, (..., 2), in the new one; NaN where no ray lands."""
         raise NotImplementedError
@@ -133,10 +139,12 @@ class Reframing:
 
 
 def reframe(sample: Sample, reframing: Reframing) -> Sample:
-    """A sample in another way; a class stays as it is."""
+    """A sample in another way; a class stays as it is, and `Labels` follow as `moved` says."""
     target = sample.target
     if isinstance(target, np.ndarray):
         target = reframing.target(target)
+    elif isinstance(target, Labels):
+        target = moved(target, reframing)
     return Sample(reframing.image(sample.image), target, reframing.lens)
 
 

@@ -1,7 +1,7 @@
 """Data sets of images with lenses: their base, and pictures of calibrated cameras."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -115,7 +115,7 @@ class Samples(Dataset):
         image = (image - self.mean) / self.std
         if self.erase:
             image = self.erase(image, rng)
-        label = as_tensor(target) if isinstance(target, np.ndarray) else target
+        label: Any = as_tensor(target) if isinstance(target, np.ndarray) else target
         return torch.from_numpy(np.ascontiguousarray(image)), lens, label
 
     def headers(self, index: int) -> Sequence[Header]:

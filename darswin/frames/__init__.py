@@ -241,7 +241,7 @@ class Sampler:
 
 
 def plan(
-    sample: "torch.nn.Module | torch.Tensor",
+    sample: "torch.nn.Module",
     lens: "Lens",
     size: tuple[int, int],
     *,
@@ -252,16 +252,14 @@ def plan(
     """Finds the places at which a network or a view reads the frames of a camera. Needs torch.
 
     Args:
-        sample: a model, which reads a polar grid or a view of its own; a `PolarSample` layer; or
-            the rays (H', W', 3) of a view, see `darswin.viz.views`. All tiles of a view are in one
-            plan.
+        sample: a model, which reads a polar grid or a view of its own, or a view of
+            `darswin.views`. All tiles of a view are in one plan.
         lens: the lens of the camera.
         size: (H, W) of the frames.
-        output: the form of the result, see `Plan`. By default it is the input of the model's or the
-            layer's sampling, "tokens" or "image", and "uint8" for rays. Only a polar grid has
-            tokens.
+        output: the form of the result, see `Plan`. By default it is the input of the network,
+            "tokens" or "image". Only a polar grid has tokens.
         mean, std: the normalization of the frames, a number for all channels or one for each; by
-            default the model's, or none for rays.
+            default the view's.
 
     Raises:
         TypeError: `sample` is none of these, or the size is not whole.

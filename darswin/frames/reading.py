@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map
 from darswin.models.base import Model
 from darswin.views import PixelView, PolarGrid, PolarView, View
 from darswin.views.base import Pair, check_lens
@@ -28,24 +27,17 @@ class Reading(NamedTuple):
 
 
 @torch.no_grad()
-def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
-    """The points at which a model, a layer or the rays of a view read images of (H, W)."""
+def reading(sample: nn.Module, lens: Lens, size: Pair) -> Reading:
+    """The points at which a model, a layer or a view reads images of (H, W)."""
     if len(check_lens(lens, size)) != 1:
         raise ValueError(f"a plan needs one lens, got {len(lens)}")
-    lens = lens.to("cpu")
-    if isinstance(sample, Tensor):
-        if sample.dim() != 3 or sample.shape[2] != 3:
-            raise ValueError(f"rays must have shape (H, W, 3), got {tuple(sample.shape)}")
-        exact = lens.to(torch.float64).project_points(sample[None].double().cpu(), size)
-        return Reading(as_map(exact)[0], "uint8", None, None, 0.0, 1.0)
     view = sample.view if isinstance(sample, Model) else sample
     if not isinstance(view, View):
-        raise TypeError(
-            "sample must be a model or a view of darswin, or rays (H, W, 3), "
-            f"got {type(sample).__name__}"
-        )
+        raise TypeError(f"sample must be a model or a view of darswin, got {type(sample).__name__}")
     channels = sample.in_chans if isinstance(sample, Model) else None
-    points = view.prepare(lens, size, back=False, rays=False).points
+    # A polar grid has the bits of `polar_sample`; the points of views are as exact as can be.
+    dtype = torch.float64 if isinstance(view, PixelView) else lens.theta_max.dtype
+    points = view.prepare(lens.to("cpu", dtype), size, back=False, rays=False).points
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
     if isinstance(view, PolarView):

@@ -7,13 +7,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.lens.spacing import Spacing
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
-from darswin.ops.checks import per_channel
+from darswin.ops.checks import per_channel, side_or_pair
 from darswin.utils.tasks import PixelTask
-from darswin.views import PlainView, Prepared
-from darswin.views.base import PerChannel, check_count
+from darswin.views import Prepared, make_view
+from darswin.views.base import Pair, PerChannel, check_count, check_one_picture
+from darswin.views.directions import Vector
 
 # About as many parameters as "darswin_unet_a" of the same size.
 _SIZES: Presets = dict(
@@ -37,24 +39,33 @@ class ConvBlock(nn.Sequential):
 
 @register_model("conv_unet", presets={}, sizes=_SIZES)
 class ConvUnet(PixelModel):
-    """A class or a distance for every pixel: a convolutional U-Net on the images as they are.
+    """A class or a distance for every pixel: a convolutional U-Net on the images, or on a view.
 
     The result is that of a `Unet`. Each level halves the resolution. Beside the colours, the first
     level reads the viewing direction (x, y, z) of each pixel, or zeros where no ray lands. That is
     the simplest way to tell a network about its lens, so it is a baseline for the other models.
+
+    The images have any size. By default the network sees them as they are. With another view, it
+    sees the pixels of the view and their viewing directions, and its logits go back to the images.
 
     Args:
         num_classes: the number of classes; "distance" ignores it.
         in_chans: C, the number of channels of the images.
         task: "segmentation" or "distance".
         widths: the number of channels of each level.
-        rays: False leaves the viewing directions out; the model then ignores its lens.
+        rays: False leaves the viewing directions out; with the view "none", the model then ignores
+            its lens.
         typical_distance: the distance, in m, around which "distance" starts.
+        view: the name of a view of pixels, one of `list_views()`. "none" takes the images as they
+            are.
+        size: (H', W') of the view in pixels, or the side of a square; "none" ignores it.
+        max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
+            own default, and views refuse the options of others.
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
             point are not normalized.
 
     Raises:
-        ValueError: a width or another option is wrong.
+        ValueError: a width or another option is wrong, or the view is of several pictures.
 
     Source: Ronneberger et al., MICCAI 2015; with padding, batch norm and bilinear upsampling. The
         rays as channels are those of CAM-Convs, CVPR 2019, in another parametrization.
@@ -71,6 +82,14 @@ class ConvUnet(PixelModel):
         widths: Sequence[int] = (15, 30, 60, 120),
         rays: bool = True,
         typical_distance: float = 10.0,
+        view: str = "none",
+        size: int | Pair = 128,
+        max_fov: float | None = None,
+        spacing: Spacing | None = None,
+        theta_max: float | None = None,
+        fov: float | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
         mean: PerChannel = 0.0,
         std: PerChannel = 1.0,
     ):
@@ -79,7 +98,13 @@ class ConvUnet(PixelModel):
             raise ValueError(f"widths must be at least 1, for at least one level, got {widths}")
         self.in_chans, self.reads_rays = in_chans, rays
         mean, std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
-        self.view = PlainView(None, mean=mean, std=std)
+        self.view = make_view(
+            view, None if view == "none" else side_or_pair("size", size), mean=mean, std=std,
+            max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov, up=up,
+            direction=direction,
+        )  # fmt: skip
+        check_one_picture(self.view)
+        self.goes_back = self.view.uses_lens
         self.feature_info = FeatureInfo(
             dict(num_chs=width, reduction=2**level, module=f"down.{level}", map_size=None)
             for level, width in enumerate(widths)
@@ -110,4 +135,4 @@ class ConvUnet(PixelModel):
             x = F.interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
             x = block(torch.cat((x, skip), 1))
         logits = self.head.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        return self.head.finish(logits)
+        return self.head.finish(self.view.back(logits, prepared))

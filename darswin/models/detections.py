@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin import boxes as of_boxes
-from darswin.lens.pixels import OUTSIDE
 from darswin.utils.tables import read_table
 from darswin.views import PolarGrid, Prepared, View
 
@@ -47,9 +46,9 @@ def detections_to_images(
 
     Returns:
         For each image, the same dicts. The boxes are cut at the borders of the image, and those of
-        several tiles are merged, the best first. "visible" (K,) is the share of each box that the
-        lens sees, and boxes that it does not see are left out. "rays" (K, 3) are the directions of
-        the middles in the camera's frame, unless the view ignores the lens.
+        several tiles are merged, the best first. "visible" (K,) is the share of each box that
+        the image shows, and boxes that it does not show are left out. "rays" (K, 3) are the
+        directions of the middles in the camera's frame, unless the view ignores the lens.
     """
     if len(found) % view.count:
         raise ValueError(
@@ -59,7 +58,7 @@ def detections_to_images(
     images = [found[k : k + view.count] for k in range(0, len(found), view.count)]
     if isinstance(prepared.points, PolarGrid):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
-    points = _tables(prepared.points, view.count)
+    points = _tables(_inside(prepared), view.count)
     rays = _tables(None if prepared.rays is None else prepared.rays.movedim(1, -1), view.count)
     results = []
     for k, tiles in enumerate(images):
@@ -78,13 +77,23 @@ def detections_to_images(
     return results
 
 
+def _inside(prepared: Prepared) -> Tensor | None:
+    """The points at which a view reads the images; NaN outside of them, as in `frames.Plan`."""
+    if prepared.points is None:
+        return None
+    assert isinstance(prepared.points, Tensor)
+    height, width = prepared.size
+    points = prepared.points
+    inside = (points > -1) & (points < points.new_tensor([width, height]))
+    return torch.where(inside.all(-1, keepdim=True), points, torch.nan)
+
+
 def _tables(values: Tensor | None, count: int) -> Any:
     """Values of the pixels of n tiles below each other, (N, n·H', W', K), as N × n arrays (H', W',
-    K) with NaN in place of `OUTSIDE`; None if the view is the image."""
+    K); None if the view is the image."""
     if values is None:
         return [[None] * count]
-    table = values.detach().double().cpu().unflatten(1, (count, -1)).numpy()
-    return np.where(table == OUTSIDE, np.nan, table)
+    return values.detach().double().cpu().unflatten(1, (count, -1)).numpy()
 
 
 def _carried(

@@ -10,7 +10,7 @@ from darswin.lens.spacing import Spacing
 from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StageSizes, stage_sizes
-from darswin.ops.checks import per_channel
+from darswin.ops.checks import per_channel, side_or_pair
 from darswin.views import make_view
 from darswin.views.base import Pair, PerChannel, check_one_picture
 from darswin.views.directions import Vector
@@ -30,8 +30,9 @@ class Swin(Encoder):
         patch_size: the side of a patch, in pixels.
         window: (rows, columns) on maps that are large enough.
         view: the name of a view whose pixels the network sees, one of `list_views()`. "none" takes
-            the images as they are and ignores the lens. The others resample the images to a view of
-            this size through the lens.
+            the images as they are and ignores the lens. The others resample the images to a view
+            through the lens.
+        size: (H', W') of the view in pixels, or the side of a square; None means image_size.
         max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
             own default, and views refuse the options of others.
         mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
@@ -62,6 +63,7 @@ class Swin(Encoder):
         patch_size: int = 2,
         window: Pair = (4, 4),
         view: str = "none",
+        size: int | Pair | None = None,
         max_fov: float | None = None,
         spacing: Spacing | None = None,
         theta_max: float | None = None,
@@ -74,18 +76,18 @@ class Swin(Encoder):
         super().__init__(
             num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate
         )
-        height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
-        self.image_size = height, width
+        self.image_size = side_or_pair("image_size", image_size)
+        height, width = seen = self.image_size if size is None else side_or_pair("size", size)
+        if view == "none" and seen != self.image_size:
+            raise ValueError(f"size must be image_size = {self.image_size} for the view 'none'")
         self.view = make_view(
-            view, self.image_size, max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov,
+            view, seen, max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov,
             up=up, direction=direction,
             mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
         )  # fmt: skip
         check_one_picture(self.view)
-        if patch_size < 1 or any(side < 1 or side % patch_size for side in (height, width)):
-            raise ValueError(
-                f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
-            )
+        if patch_size < 1 or height % patch_size or width % patch_size:
+            raise ValueError(f"patch_size must divide the view's (H, W) = {seen}, got {patch_size}")
         rows, columns = height // patch_size, width // patch_size
         self.patch_embed = PatchEmbed(in_chans, embed_dim, patch_size)
         sizes = stage_sizes(rows, columns, len(depths), "RA", window)

@@ -108,6 +108,11 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     return first, second
 
 
+def side_or_pair(name: str, size: int | Sequence[int]) -> tuple[int, int]:
+    """(H, W) of at least 1, from such a pair or the side of a square; else as `check_pair`."""
+    return check_pair(name, (size, size) if isinstance(size, int) else size, lowest=1)
+
+
 def check_has_batch(
     name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
 ) -> None:

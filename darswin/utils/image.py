@@ -12,9 +12,11 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
-from darswin.utils.files import check_is_file
+from darswin.utils.files import check_is_file, replace_file
 
 __all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
+
+WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _LAST = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # what complete files have at their ends
@@ -52,6 +54,19 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     image = image.swapaxes(0, 1) if swapped else image
     across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
     return np.ascontiguousarray(image[down, across]), orientation
+
+
+def written_as(path: Path) -> Path:
+    """The name that `write_image` can write: other endings get .png in addition."""
+    return path if path.suffix.lower() in WRITTEN else path.with_name(f"{path.name}.png")
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Writes a picture (H, W, C) uint8, RGB or grey, completely or not at all."""
+    done, content = cv2.imencode(path.suffix, image[..., ::-1])
+    if not done:
+        raise OSError(f"OpenCV cannot write {path}")
+    replace_file(path, content.data)
 
 
 class Header(NamedTuple):

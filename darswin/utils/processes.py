@@ -24,9 +24,7 @@ def die_with_first_process() -> Iterator[None]:
     """
     first = os.environ.get(_FIRST)
     if first is not None and os.environ.get("LOCAL_RANK", "0") != "0":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != int(first):
-            raise SystemExit(1)
+        die_with_parent(int(first))
         yield
         return
     os.environ[_FIRST] = str(os.getpid())
@@ -34,6 +32,13 @@ def die_with_first_process() -> Iterator[None]:
         yield
     finally:
         os.environ.pop(_FIRST, None)
+
+
+def die_with_parent(parent: int) -> None:
+    """Lets this process die together with its parent, even by a kill; SystemExit: it is dead."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        raise SystemExit(1)
 
 
 def end_with_failed_process(others: Sequence[subprocess.Popen], hint: str) -> None:

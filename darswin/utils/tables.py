@@ -10,14 +10,23 @@ def read_table(table: np.ndarray, points: np.ndarray) -> np.ndarray:
     its border. It is NaN farther outside, and beside entries that are NaN.
     """
     points = np.asarray(points, np.float64)
-    height, width = table.shape[:2]
-    x, y = points[..., 0], points[..., 1]
+    height, width, count = table.shape
+    x, y = np.moveaxis(points, -1, 0).reshape(2, -1)
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)  # not for NaN
-    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-    left = np.clip(np.floor(x), 0, max(width - 2, 0)).astype(np.intp)
-    top = np.clip(np.floor(y), 0, max(height - 2, 0)).astype(np.intp)
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    across, down = (x - left)[..., None], (y - top)[..., None]
-    upper = table[top, left] * (1 - across) + table[top, right] * across
-    lower = table[below, left] * (1 - across) + table[below, right] * across
-    return np.where(inside[..., None], upper * (1 - down) + lower * down, np.nan)
+    if not inside.all():
+        x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+    left = np.clip(x.astype(np.intp), 0, max(width - 2, 0))
+    top = np.clip(y.astype(np.intp), 0, max(height - 2, 0))
+    corner, right, below = top * width + left, int(width > 1), width * int(height > 1)
+    # Contiguous rows of numbers are several times as fast as many short ones.
+    across, down = np.repeat(x - left, count), np.repeat(y - top, count)
+    entries = table.reshape(-1, count)
+
+    def row(start: np.ndarray) -> np.ndarray:
+        first, last = (entries.take(place, 0).ravel() for place in (start, start + right))
+        return first * (1 - across) + last * across
+
+    found = (row(corner) * (1 - down) + row(corner + below) * down).reshape(-1, count)
+    if not inside.all():
+        found[~inside] = np.nan
+    return found.reshape(*points.shape[:-1], count)

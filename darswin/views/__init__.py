@@ -6,18 +6,16 @@ from darswin.views.base import (
     PolarGrid,
     Prepared,
     View,
-    list_views,
-    make_view,
-    register_view,
 )
 from darswin.views.cylindrical import CylindricalView
-from darswin.views.directions import RayView, up_of
+from darswin.views.directions import RayView, turned, up_of
 from darswin.views.equirectangular import EquirectangularView
 from darswin.views.mercator import MercatorView
 from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.plain import PlainView
 from darswin.views.polar import PolarSample, PolarView, polar_grid
+from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
 from darswin.views.tangent import TangentView
@@ -46,5 +44,6 @@ __all__ = [
     "make_view",
     "polar_grid",
     "register_view",
+    "turned",
     "up_of",
 ]

@@ -1,6 +1,5 @@
-"""The seam between lenses and networks: what a view is, and views by name."""
+"""The seam between lenses and networks: what a view is."""
 
-import inspect
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -308,10 +307,11 @@ def _exactly(points: Points, lens: Lens, move: Callable[[Tensor, Lens], Tensor])
     """Moves points (..., 2) through one lens in float64."""
     if len(lens) != 1:
         raise ValueError(f"points move through one lens, got {len(lens)}")
-    if isinstance(points, np.ndarray):
-        exact = torch.from_numpy(points.astype(np.float64))
+    if not isinstance(points, Tensor):
+        places = np.asarray(points)
+        exact = torch.from_numpy(places.astype(np.float64))
         moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
-        return moved.numpy().astype(np.result_type(points, np.float32), copy=False)
+        return moved.numpy().astype(np.result_type(places, np.float32), copy=False)
     moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]
     return moved.to(torch.promote_types(points.dtype, torch.float32))
 
@@ -378,54 +378,3 @@ def check_count(lenses: int, images: Tensor) -> None:
         raise ValueError(
             f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
         )
-
-
-_VIEWS: dict[str, Callable[..., View]] = {}
-_Make = TypeVar("_Make", bound=Callable[..., View])
-
-
-def register_view(name: str) -> Callable[[_Make], _Make]:
-    """Registers the decorated class or function, which makes the view.
-
-    It is called `make((H', W'), mean=…, std=…, **options)`.
-    """
-
-    def register(make: _Make) -> _Make:
-        _VIEWS[name] = make
-        return make
-
-    return register
-
-
-def list_views() -> list[str]:
-    """The names of all views that `make_view` can make."""
-    return sorted(_VIEWS)
-
-
-def make_view(
-    name: str,
-    size: Pair,
-    *,
-    mean: PerChannel | None = 0.0,
-    std: PerChannel | None = 1.0,
-    **options: Any,
-) -> View:
-    """The view with this name, of (H', W').
-
-    Args:
-        mean, std: the arguments of `View`.
-        options: the other arguments of the view. None stands for the default of an argument.
-
-    Raises:
-        ValueError: the name is unknown.
-        TypeError: the view has no such option.
-    """
-    if name not in _VIEWS:
-        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
-    make, given = _VIEWS[name], {k: value for k, value in options.items() if value is not None}
-    given |= dict(mean=mean, std=std)
-    try:
-        inspect.signature(make).bind(size, **given)
-    except TypeError as error:
-        raise TypeError(f"the view {name!r} has no such option: {error}") from error
-    return make(size, **given)

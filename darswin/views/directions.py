@@ -1,7 +1,9 @@
 """Views whose pixels look along rays of the camera: maps of the sphere, upright if you know up."""
 
+import copy
 import math
 from collections.abc import Sequence
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +13,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
-from darswin.utils.angles import degrees_hint
+from darswin.utils.angles import check_turn, degrees_hint
 from darswin.views.base import Pair, PerChannel, PixelView, Prepared
 
 Vector = Sequence[float] | Tensor
@@ -20,7 +22,7 @@ PICTURE_TOP = (0.0, -1.0, 0.0)
 AXIS = (0.0, 0.0, 1.0)
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
 _STEPS = 361  # points at which the end of what a lens sees is looked for
-_BISECTIONS = 16
+_BISECTIONS = 12
 _APART = 1.5  # pixels of the image between points at which it is read
 _MOST_READS = 4
 
@@ -56,7 +58,7 @@ class RayView(PixelView):
 
     size: Pair
     upright = False  # True if all columns are vertical in the world, and not only the middle one
-    at_horizon = False  # True if a view of a whole lens is near the horizon, not at `direction`
+    around = False  # True if a view shows all around the horizon, and not as much as the lens
     reach = math.pi  # the largest angle from the middle that a view of a whole lens shows, rad
     widest = 2 * math.pi  # the largest fov
 
@@ -83,6 +85,14 @@ class RayView(PixelView):
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
+        self._known: tuple[Tensor, Tensor] | None = None
+
+    def for_lens(self, lens: Lens, size: Pair) -> Self:
+        """The same view of lenses like this one alone: it finds once what it covers of them, which
+        takes most of the time of `to_view`. size: (H, W) of the images."""
+        view = copy.copy(self)
+        view._known = self._layout(lens, size)
+        return view
 
     def to_plane(self, rays: Tensor) -> Tensor:
         """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
@@ -109,8 +119,12 @@ class RayView(PixelView):
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
         of its size: the inverse of `to_rays`. NaN where the view shows nothing."""
+        rays = F.normalize(rays, dim=-1)
+        return self._points(rays, self._shows(rays), lens, size)
+
+    def _points(self, rays: Tensor, shown: Tensor, lens: Lens, size: Pair) -> Tensor:
+        """`to_points` of unit vectors; NaN unless they are shown."""
         step, middle = self._layout(lens, size)
-        shown = self._shows(rays := F.normalize(rays, dim=-1))
         # NaN must not reach the gradients.
         rays = torch.where(shown[..., None], rays, tensor_there(self.direction, rays))
         flat = self.to_plane(rays @ self._turn(rays))
@@ -128,10 +142,7 @@ class RayView(PixelView):
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
         grid = pixel_grid(size, lens.theta_max)
         rays = lens.unproject_points(grid, size)
-        seen = ~rays.isnan().any(-1, keepdim=True)
-        rays = torch.where(seen, rays, tensor_there(self.direction, rays))
-        points = self.to_points(rays, lens, size)
-        return as_map(torch.where(seen, points, torch.nan))
+        return as_map(self._points(rays, self._shows(rays), lens, size))
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         rays = self._rays(lens, size)
@@ -188,6 +199,8 @@ class RayView(PixelView):
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
         1, 2)."""
+        if self._known is not None:
+            return self._known
         lens = lens.detach()
         start = self._start(lens.theta_max)
         if self.fov is not None:
@@ -195,25 +208,23 @@ class RayView(PixelView):
         # Upright views are as wide as the lens sees on the horizon, if it sees that at all.
         horizon = torch.zeros_like(start)
         row = torch.where(self._sees(lens, horizon[None], size)[..., None], horizon, start)[:, 0]
-        left, right = self._across(lens, row, size)
-        upper, lower = (
-            self._end(lens, start, self._highest(start, sign), size)[:, 1] for sign in (-1, 1)
-        )
+        edge = row.new_tensor([self.half_width(self.reach), 0.0])
+        begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
+        ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
+        goals = torch.stack(torch.broadcast_tensors(*ends), 1)
+        seen = self._seen_ends(lens, begins, goals, size)
+        left, right, upper, lower = *seen[:, :2, 0].unbind(1), *seen[:, 2:, 1].unbind(1)
+        if self.around:
+            left, right = torch.full_like(left, -math.pi), torch.full_like(right, math.pi)
         step = (right - left) / self.size[1]
         if not self.upright:
             step = torch.maximum(step, (lower - upper) / self.size[0])
         half = step * (self.size[0] / 2)
         first, last = upper + half, lower - half  # of the middles that show nothing unseen
-        wanted = (horizon if self.at_horizon else start)[:, 1]
+        wanted = (horizon if self.around else start)[:, 1]
         y = torch.minimum(torch.maximum(wanted, first), last)
         y = torch.where(first <= last, y, (upper + lower) / 2)
         return step[:, None], torch.stack(((left + right) / 2, y), -1)
-
-    def _across(self, lens: Lens, row: Tensor, size: Pair) -> tuple[Tensor, Tensor]:
-        """The ends (N,) of what a lens sees along the row at points (N or 1, 2) of the plane."""
-        edge = self.half_width(self.reach)
-        left, right = (row + row.new_tensor([x, 0.0]) for x in (-edge, edge))
-        return self._end(lens, row, left, size)[:, 0], self._end(lens, row, right, size)[:, 0]
 
     def _start(self, like: Tensor) -> Tensor:
         """The point of the plane (1, 2) at `direction`, or at its nearest elevation that is not too
@@ -231,22 +242,25 @@ class RayView(PixelView):
         steepest = (0.0, sign * math.sin(_STEEPEST), math.cos(_STEEPEST))
         return self.to_plane(start.new_tensor([steepest]))
 
-    def _end(self, lens: Lens, start: Tensor, end: Tensor, size: Pair) -> Tensor:
-        """The last point of the plane that the images show from one point (N or 1, 2) to another,
-        (N, 2)."""
-        shares = torch.linspace(0, 1, _STEPS, dtype=start.dtype, device=start.device)
+    def _seen_ends(self, lens: Lens, begins: Tensor, ends: Tensor, size: Pair) -> Tensor:
+        """The last points of the plane that the images show on the ways from K points (N or 1, K,
+        2) to K others, (N, K, 2)."""
+        shares = torch.linspace(0, 1, _STEPS, dtype=begins.dtype, device=begins.device)
 
-        def at(share: Tensor) -> Tensor:
-            return start[:, None] + (end - start)[:, None] * share[..., None]
+        def at(share: Tensor) -> Tensor:  # (N or 1, K, J) → (N or 1, K, J, 2)
+            return begins[:, :, None] + (ends - begins)[:, :, None] * share[..., None]
 
-        seen = self._sees(lens, at(shares[None]), size)
-        count = seen.int().cumprod(1).sum(1, keepdim=True)
+        def sees(share: Tensor) -> Tensor:
+            points = at(share)
+            return self._sees(lens, points.flatten(1, 2), size).unflatten(1, points.shape[1:3])
+
+        count = sees(shares[None, None]).int().cumprod(2).sum(2, keepdim=True)
         low, high = (shares[(count + k).clamp(0, _STEPS - 1)] for k in (-1, 0))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            inside = self._sees(lens, at(middle), size)
+            inside = sees(middle)
             low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-        return at(low)[:, 0]
+        return at(low)[:, :, 0]
 
     def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:
         """True where images of (H, W) show points (N or 1, K, 2) of the plane, (N, K)."""
@@ -338,6 +352,25 @@ def up_of(
         raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
     up = rotation.T @ torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
     return unit_vector("up", up)
+
+
+def turned(yaw: float = 0.0, pitch: float = 0.0) -> dict[str, Any]:
+    """The options `up` and `direction` of a view that looks `yaw` to the right and `pitch` up.
+
+    The view is pitched about the camera's x axis first, and then turned about its y axis. Give the
+    `direction` alone to a view that stays level with another `up`.
+
+    Args:
+        yaw, pitch: in [-2π, 2π] rad.
+    """
+    check_turn("yaw", yaw)
+    check_turn("pitch", pitch)
+    ahead, above = math.cos(pitch), math.sin(pitch)
+    right, forward = math.sin(yaw), math.cos(yaw)
+    return dict(
+        up=(-above * right, -ahead, -above * forward),
+        direction=(ahead * right, -above, ahead * forward),
+    )
 
 
 def _row(values: Tensor, dim: int) -> Tensor:

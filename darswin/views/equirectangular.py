@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from darswin.lens.solve import length_of
-from darswin.views.base import register_view
 from darswin.views.directions import RayView
+from darswin.views.registry import register_view
 
 
 @register_view("equirectangular")

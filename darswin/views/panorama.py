@@ -1,14 +1,9 @@
 """All around a camera, upright: for cameras that look down or up."""
 
-import math
-
-import torch
-from torch import Tensor
-
-from darswin.lens import Lens
-from darswin.views.base import Pair, PerChannel, register_view
+from darswin.views.base import Pair, PerChannel
 from darswin.views.directions import Vector
 from darswin.views.mercator import MercatorView
+from darswin.views.registry import register_view
 
 
 @register_view("panorama")
@@ -22,7 +17,7 @@ class PanoramaView(MercatorView):
     The arguments and errors are those of `RayView`, but `fov` is 2π.
     """
 
-    at_horizon = True
+    around = True
 
     def __init__(
         self,
@@ -38,7 +33,3 @@ class PanoramaView(MercatorView):
         super().__init__(
             size, None, theta_max, up=up, direction=direction, reads=reads, mean=mean, std=std
         )
-
-    def _across(self, lens: Lens, row: Tensor, size: Pair) -> tuple[Tensor, Tensor]:
-        end = torch.full_like(lens.theta_max, math.pi)
-        return -end, end

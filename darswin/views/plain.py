@@ -6,7 +6,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens, pixels
-from darswin.views.base import Pair, PixelView, Prepared, register_view
+from darswin.views.base import Pair, PixelView, Prepared
+from darswin.views.registry import register_view
 
 
 @register_view("none")

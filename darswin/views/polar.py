@@ -36,8 +36,8 @@ from darswin.views.base import (
     check_count,
     check_lens,
     check_seen_images,
-    register_view,
 )
+from darswin.views.registry import register_view
 
 Layout = Literal["tokens", "image"]
 Placement = Literal["centers", "edges"]

@@ -15,7 +15,8 @@ from darswin.lens.concentric import (
 from darswin.lens.pixels import OUTSIDE
 from darswin.lens.solve import length_of, vector_of
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
-from darswin.views.base import Pair, PerChannel, PixelView, Prepared, register_view
+from darswin.views.base import Pair, PerChannel, PixelView, Prepared
+from darswin.views.registry import register_view
 
 
 @register_view("square")

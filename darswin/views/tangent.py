@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.views.base import register_view
 from darswin.views.directions import RayView
+from darswin.views.registry import register_view
 
 
 @register_view("tangent")

@@ -17,7 +17,6 @@ from darswin.views.base import (
     Prepared,
     check_count,
     check_seen_images,
-    register_view,
 )
 from darswin.views.directions import (
     AXIS,
@@ -27,16 +26,17 @@ from darswin.views.directions import (
     frame_of,
     unit_vector,
 )
+from darswin.views.registry import register_view
 from darswin.views.stereographic import StereographicView
 
 # For each count: whether a tile is in the middle; and in degrees, for fields of view from 165°, the
 # angle of the others from the middle, their first azimuth, and the field of view of a tile.
 _LAYOUTS = {
-    4: (False, 50, 0, 100),
+    4: (False, 45, 0, 105),
     5: (True, 60, 0, 85),
     6: (True, 60, -90, 85),
     7: (True, 60, 0, 80),
-    8: (True, 60, -90, 80),
+    8: (True, 65, -90, 80),
     9: (True, 65, 0, 80),
 }
 _WHOLE = math.radians(165)  # for wider lenses, tiles that look farther aside found no more

@@ -20,7 +20,9 @@ from matplotlib.ticker import LogLocator, PercentFormatter, StrMethodFormatter
 from darswin.utils.image import with_channels
 from darswin.viz.plot import TEXT, add_legend, page_figure
 
-__all__ = ["distance_image", "distance_range", "label_image", "overlay", "palette"]
+__all__ = [
+    "distance_image", "distance_range", "draw_boxes", "label_image", "overlay", "palette",
+]  # fmt: skip
 
 UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
 MOST_CLASSES = 255  # 8 bits of a label picture, of which 255 means none
@@ -162,6 +164,35 @@ def overlay(
     below = with_channels(image, 3)
     laid = cv2.addWeighted(below, 1 - alpha, picture, alpha, 0)
     return laid if where is None else cv2.copyTo(laid, where.astype(np.uint8), below.copy())
+
+
+def draw_boxes(
+    image: np.ndarray,
+    boxes: np.ndarray,
+    texts: Sequence[str],
+    colors: Sequence[Sequence[int]],
+) -> np.ndarray:
+    """Draws boxes and their texts on an image (H, W, 1 or 3) uint8: (H, W, 3) uint8.
+
+    Args:
+        boxes: (K, 4), x0, y0, x1 and y1 in px, where the image covers (0, 0) to (W, H); of any
+            order, the first on top.
+        texts: of each box; ASCII, as OpenCV draws them. colors: (r, g, b) of each box.
+    """
+    drawn = with_channels(image, 3).copy()
+    scale = max(image.shape[:2]) / 1500
+    thick, letters = max(1, round(2 * scale)), max(0.4, 0.8 * scale)
+    every = list(zip(boxes, texts, colors, strict=True))
+    for box, text, color in reversed(every):
+        # A box ends at the edge of its last pixel.
+        left, top, right, bottom = np.rint(np.add(box, (0, 0, -1, -1))).astype(int).tolist()
+        cv2.rectangle(drawn, (left, top), (right, bottom), color, thick)
+        (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, letters, thick)
+        foot = max(top, height + below)  # inside of the picture
+        cv2.rectangle(drawn, (left, foot - height - below), (left + width, foot), color, cv2.FILLED)
+        place = left, foot - below // 2
+        cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, letters, (0, 0, 0), thick)
+    return drawn
 
 
 def draw_predictions(

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -29,7 +30,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
 from darswin.utils.files import replace_file
-from darswin.views import PolarGrid, PolarView
+from darswin.views import PixelView, PolarGrid, PolarView
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
 from darswin.viz.views import undistort, view_map
 
@@ -181,34 +182,38 @@ def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes)
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
 
 
-def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes) -> None:
-    """Draws the view along rays (H, W, 3) of `darswin.viz.views`. The ticks are the angles from the
-    central ray, in the middle row and column of the view; they rise to the right and upwards."""
-    x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
-    height, width = image.shape[:2]
-    beyond = (x == OUTSIDE) & (y == OUTSIDE)
-    outside = ~beyond & ((x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5))
-    _show(axes, undistort(image, lens, rays), beyond | outside)
-    lines = ((axes.xaxis, _middle(rays), 1), (axes.yaxis, _middle(rays.transpose(0, 1)), -1))
-    for axis, line, sign in lines:
-        positions, degrees = _angle_ticks(line, max(2, 5 * len(line) // max(rays.shape[:2])))
+def draw_view(image: np.ndarray, lens: Lens, view: PixelView, *, axes: Axes) -> None:
+    """Draws the image as a view of one picture shows it. The ticks are the angles from the middle
+    of the view, in its middle row and column; they rise to the right and upwards."""
+    if view.count != 1:
+        raise ValueError(f"a figure shows a view of one picture, got {view.count}")
+    lens, size = _one(lens), (image.shape[0], image.shape[1])
+    points, reads = view_map(lens, view, size), view.reads_of(size)
+    height, width = points.shape[0] // reads, points.shape[1] // reads
+    beyond = (points == OUTSIDE).all(-1)
+    outside = beyond | ((points < -0.5) | (points > (size[1] - 0.5, size[0] - 0.5))).any(-1)
+    # A pixel is hatched if all of its points are.
+    beyond, outside = (
+        x.reshape(height, reads, width, reads).all((1, 3)) for x in (beyond, outside)
+    )
+    _show(axes, undistort(image, lens, view), outside)
+    x, y = torch.arange(width), torch.arange(height)
+    row = torch.stack((x, torch.full((width,), (height - 1) / 2)), -1)
+    column = torch.stack((torch.full((height,), (width - 1) / 2), y), -1)
+    for axis, pixels, sign in ((axes.xaxis, row, 1), (axes.yaxis, column, -1)):
+        rays = view.to_rays(pixels[None].to(torch.float64), lens, size)[0]
+        most = max(2, 5 * len(rays) // max(height, width))
+        positions, degrees = _angle_ticks(F.normalize(rays, dim=-1), most)
         axis.set_ticks(positions, [f"{sign * angle + 0:g}°" for angle in degrees])
-    axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
-
-
-def _middle(rays: Tensor) -> Tensor:
-    """The middle row of rays (H, W, 3) as unit vectors, (W, 3) float64."""
-    rays = torch.nn.functional.normalize(rays.detach().to("cpu", torch.float64), dim=-1)
-    rows = rays[(len(rays) - 1) // 2], rays[len(rays) // 2]
-    return torch.nn.functional.normalize(rows[0] + rows[1], dim=-1)
+    axes.set(xlabel=_label("degrees from the view's middle", outside & ~beyond, beyond))
 
 
 def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The positions of ticks on a line of rays (n, 3), and their round angles from the middle in
-    degrees; at most `most` steps."""
-    seen = line.any(-1).numpy()
+    """The positions of ticks on a line of unit vectors (n, 3), NaN where nothing is seen, and their
+    round angles from the middle in degrees; at most `most` steps."""
+    seen = ~line.isnan().any(-1).numpy()
     half = (len(line) - 1) / 2
-    middle = torch.nn.functional.normalize(line[math.floor(half)] + line[math.ceil(half)], dim=0)
+    middle = F.normalize(line[math.floor(half)] + line[math.ceil(half)], dim=0)
     apart = torch.linalg.cross(line, middle.expand_as(line)).norm(dim=-1)
     positions = np.arange(len(line))
     degrees = torch.rad2deg(torch.atan2(apart, line @ middle)).numpy() * np.sign(positions - half)
@@ -273,14 +278,14 @@ def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
 
 
 def draw_lens(
-    image: np.ndarray, lens: Lens, sampler: PolarView, view: Tensor, title: str = "undistorted"
+    image: np.ndarray, lens: Lens, sampler: PolarView, view: PixelView, title: str = "undistorted"
 ) -> Figure:
     """Draws a lens: partition, sample points, a view, polar image, projection curve.
 
     Args:
         image: (H, W) or (H, W, 3), uint8 or floats in [0, 1]. lens: one, of the image.
         sampler: how it is cut and sampled, as `model.view`.
-        view: (H, W, 3), the rays of the view. title: of the view.
+        view: of one picture. title: of the view.
 
     Raises:
         ValueError: more than one lens.

@@ -45,7 +45,9 @@ def command_of(*argv):
 
     def function(source: str, others: Sequence[str] = (), *, count: int, rate: float = 0.5,
                  kind: Literal["a", "b"] | None = None, sides: tuple[int, int] = (1, 2),
-                 names: list[str] | None = None, out: Path | None = None):  # fmt: skip
+                 names: list[str] | None = None, out: Path | None = None,
+                 shares: list[float] | None = None,
+                 up: tuple[float, float, float] | None = None):  # fmt: skip
         """Does nothing.
 
         Args:
@@ -62,11 +64,15 @@ def command_of(*argv):
 
 def test_a_function_gets_its_arguments(capsys):
     usual = dict(source="s", others=(), count=3, rate=0.5, kind=None, sides=(1, 2), names=None)
+    usual |= dict(shares=None, up=None)
     assert command_of("s", "--count", "3") == usual | {"out": None}
     assert command_of("s", "a", "b", "--count=-3", "--rate", "1e-3", "--kind", "b", "--sides",
                       "4", "5", "--names", '["x", "y"]', "--out", "o") == dict(
         source="s", others=["a", "b"], count=-3, rate=1e-3, kind="b", sides=(4, 5),
-        names=["x", "y"], out=Path("o"))  # fmt: skip
+        names=["x", "y"], out=Path("o"), shares=None, up=None)  # fmt: skip
+    numbers = command_of("s", "--count", "3", "--shares", "1,.5", "--up", "0", "-1", "1e-2")
+    assert numbers == usual | dict(out=None, shares=[1.0, 0.5], up=(0.0, -1.0, 0.01))
+    assert all(type(number) is float for number in (*numbers["shares"], *numbers["up"]))
     given = ("s", "--count", "3", "--rate", "2", "--kind", "null", "--out", "null", "--names")
     assert command_of(*given) == usual | dict(rate=2.0, names=[], out=None)
     with pytest.raises(SystemExit) as end:
@@ -89,6 +95,9 @@ def test_a_function_gets_its_arguments(capsys):
         ("s --count 3 --kind c", "--kind must be one of a, b, got c"),
         ("s --count 3 --sides 1", "--sides must be 2 whole numbers, such as 10,10, got [1]"),
         ("s --count 3 --sides 1,x", "--sides must be 2 whole numbers, such as 10,10, got 1,x"),
+        ("s --count 3 --up 0,1", "--up must be 3 numbers, such as 0.5,0.5,0.5, got [0,1]"),
+        ("s --count 3 --up 0,a,1", "--up must be 3 numbers, such as 0.5,0.5,0.5, got 0,a,1"),
+        ("s --count 3 --shares a", "--shares must be numbers, such as 0.5,1, got a"),
         ("s --count 3 --names [1]", "--names must be a list of texts, got [1]"),
         ("s --count 3 --names [", "--names must be a list of texts, got ["),
         ("s --count 3 --speed 2", "unrecognized arguments: --speed 2"),

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from lens_examples import FILES, FRONT
 
 from darswin.cli import lens as cli
 from darswin.cli.main import main
+from darswin.cli.views import View
 from darswin.lens import Perspective, Polynomial, from_dict, to_dict
 from darswin.viz import plot
 
@@ -74,8 +76,18 @@ def refusal(capsys, *arguments):
 @pytest.mark.parametrize(
     "options, said",
     [
-        (["--fov_deg", "0"], "--fov_deg must be above 0° and below 180° for a perspective view"),
-        (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
+        (
+            ["--fov_deg", "0"],
+            "--fov_deg must be above 0° and at most 179.9° for a perspective view",
+        ),
+        (["--fov_deg=180"], "--fov_deg must be above 0° and at most 179.9° .*, got 180"),
+        (["--view=stereographic", "--fov_deg=341"], "at most 340° for a stereographic view"),
+        (["--view=panorama", "--fov_deg=90"], "--fov_deg must be 360° for a panorama view, got 90"),
+        (["--view=square", "--pitch_deg=9"], "--pitch_deg must be 0 for a square view, which"),
+        (["--up=0,0,0"], r"--up must be three finite .*, got \(0.0, 0.0, 0.0\)"),
+        (["--up=0,.inf,0"], "--up must be"),
+        (["--up=0,1"], "--up must be 3 numbers, such as 0.5,0.5,0.5, got"),
+        (["--up=0,1" + "0" * 400 + ",2"], "--up must be three finite numbers"),
         (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
         (["--yaw_deg=inf"], "--yaw_deg must be from -360° to 360°, got inf"),
         (["--theta_max_deg=0"], "--theta_max_deg must be above 0° and at most 180°, got 0"),
@@ -151,7 +163,7 @@ def test_cameras_of_a_file_are_listed(capsys):
     assert "cam1, of 2: cam0, cam1" in printed and "principal point" in printed
 
 
-@pytest.mark.parametrize("view", ["perspective", "cylindrical", "equirectangular"])
+@pytest.mark.parametrize("view", get_args(View))
 def test_views_stay_small(folder, monkeypatch, view):
     """The equirectangular one of 0.01° asked for 92 GB."""
     found = []
@@ -161,12 +173,13 @@ def test_views_stay_small(folder, monkeypatch, view):
         lens = Perspective(100.0, 1.4, image_size=size)
         (folder / "flat.json").write_text(json.dumps(to_dict(lens)))
         cv2.imwrite(str(folder / "flat.png"), np.zeros(size, np.uint8))
-        for fov in ("1e-9", "20", "179", "null"):
+        yaw, pitch = (0, 0) if view == "square" else (20, -7.5)
+        for fov in ("null",) * 4 if view == "panorama" else ("1e-9", "20", "179", "null"):
             main(["lens", "show", str(folder / "flat.json"), str(folder / "flat.png"), "--view",
-                  view, "--yaw_deg=20", "--pitch_deg=-7.5", "--fov_deg", fov])  # fmt: skip
+                  view, f"--yaw_deg={yaw}", f"--pitch_deg={pitch}", "--fov_deg", fov])  # fmt: skip
     assert len(found) == 12
-    for _, rays, title in found:
-        assert max(rays.shape[:2]) == 800 and "yaw 20°, pitch -7.5°" in title
+    for _, shown, title in found:
+        assert max(shown.size) == 800 and f"yaw {yaw}°, pitch {pitch}°" in title
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
@@ -203,9 +216,9 @@ LISTS = st.sampled_from(
 OPTIONS = st.one_of(
     st.tuples(st.sampled_from(["rings", "sectors", "fov_deg", "yaw_deg", "pitch_deg", "foo",
                                "theta_max_deg", "camera"]), NUMBERS),
-    st.tuples(st.sampled_from(["samples", "image_size"]), LISTS),
-    st.tuples(st.just("view"), st.sampled_from(["perspective", "cylindrical", "equirectangular",
-                                                "square"])),
+    st.tuples(st.sampled_from(["samples", "image_size", "up"]), LISTS),
+    st.tuples(st.just("up"), st.sampled_from(["0,-1,0", "1e-320,0,0", "0,.nan,1", "1,1,-1e308"])),
+    st.tuples(st.just("view"), st.sampled_from(get_args(View))),
     st.tuples(st.just("spacing"), st.sampled_from(["theta", "tan", "g", "radius", "r"])),
     st.tuples(st.just("out"), st.sampled_from(["a.png", "a.foo", "a", "", "."])),
     st.tuples(st.just("coefficients"), st.sampled_from(["fisheye", "x"])),
@@ -242,8 +255,8 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
     for name, value in options:
         argv += [f"--{name}", *value.split()] if apart else [f"--{name}={value}"]
 
-    def draw(image, lens, sampler, rays, title):
-        assert rays.shape[0] * rays.shape[1] <= 800**2 and len(title) < 100
+    def draw(image, lens, sampler, view, title):
+        assert math.prod(view.size) <= 800**2 and len(title) < 100
         assert sampler.rings * sampler.sectors * math.prod(sampler.samples) <= 2**22
 
     code, out, err = 0, io.StringIO(), io.StringIO()

@@ -1,5 +1,6 @@
 """`darswin lens undistort` and `darswin lens crop`, with OpenCV as the oracle."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -17,6 +18,8 @@ from darswin.cli.main import main
 from darswin.data.cameras import Calibrations
 from darswin.lens import Equidistant, to_dict
 from darswin.utils.video import read_frames
+from darswin.views import make_view
+from darswin.viz.views import undistort
 
 SIZE = (96, 128)  # of the calibration's pictures
 K = np.array([[52.0, 0.0, 62.0], [0.0, 51.0, 49.5], [0.0, 0.0, 1.0]])
@@ -87,6 +90,11 @@ def rays_by_hand(view, size, fov):
         return rays * np.sign(np.cos(across))[..., None]
     if view == "equirectangular":
         return np.stack((np.tan(across), np.tan(down) / np.cos(across), np.ones_like(down)), -1)
+    if view == "mercator":
+        return np.stack((np.tan(across), np.sinh(down) / np.cos(across), np.ones_like(down)), -1)
+    if view == "stereographic":  # z is 1 - tan²(θ/2), over 1 + tan²(θ/2)
+        right, below = (2 * math.tan(fov / 4) / fov * side for side in (across, down))
+        return np.stack((2 * right, 2 * below, 1 - right**2 - below**2), -1)
     a, b = (2 * u + 1) / width - 1, (2 * v + 1) / height - 1  # Shirley and Chiu's four triangles
     right = np.abs(a) > np.abs(b)
     with np.errstate(all="ignore"):
@@ -96,22 +104,57 @@ def rays_by_hand(view, size, fov):
     return np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
 
 
-@pytest.mark.parametrize("view", ["cylindrical", "equirectangular", "square"])
-@pytest.mark.parametrize("yaw", [0, 20])
-def test_other_views_are_those_of_their_formulas(folder, view, yaw):
-    size = (60, 60) if view == "square" else (40, 72)
-    out = run(folder, f"--view={view}", "--fov_deg=100", f"--yaw_deg={yaw}", "--size", *size)
-    turn = cv2.Rodrigues(np.array([0.0, math.radians(yaw), 0.0]))[0]
-    rays = rays_by_hand(view, size, math.radians(100)).reshape(-1, 1, 3) @ turn.T
+def shown_by_hand(image, view, size, fov, turn):
+    """A view by OpenCV's fisheye model, turned by the rotation vector `turn` in degrees."""
+    rotation = cv2.Rodrigues(np.radians(turn))[0]
+    rays = rays_by_hand(view, size, fov).reshape(-1, 1, 3) @ rotation.T
     places, _ = cv2.fisheye.projectPoints(rays, np.zeros(3), np.zeros(3), K, D)
     places = np.where(rays[:, :, 2:] > 0.02, places, -10)
-    places = places.reshape(*size, 2).astype(np.float32)
-    expected = cv2.remap(picture(), places, None, cv2.INTER_LINEAR)
+    return cv2.remap(image, places.reshape(*size, 2).astype(np.float32), None, cv2.INTER_LINEAR)
+
+
+TURNS = {
+    "": (0.0, 0.0, 0.0),
+    "--yaw_deg=20": (0.0, 20.0, 0.0),
+    "--pitch_deg=-15": (-15.0, 0.0, 0.0),
+    "--up=0.5,-0.8660254,0": (0.0, 0.0, 30.0),  # the picture's top leans to the left
+}
+CURVED = ("cylindrical", "equirectangular", "mercator", "stereographic")
+
+
+@pytest.mark.parametrize(("view", "option"), [*itertools.product(CURVED, TURNS), ("square", "")])
+def test_other_views_are_those_of_their_formulas(folder, view, option):
+    size = (60, 60) if view == "square" else (40, 72)
+    options = [option] if option else []
+    out = run(folder, f"--view={view}", "--fov_deg=100", *options, "--size", *size)
+    expected = shown_by_hand(picture(), view, size, math.radians(100), TURNS[option])
     found = read(out / "a.png")
     assert found.shape == (*size, 3) and (found.min(-1) > 0).mean() > 0.5
     off = np.abs(found.astype(int) - expected).max(-1)
     assert (off <= 3).mean() > 0.99 and off.mean() < 0.5
     assert not (out / "lens.json").exists()
+
+
+@pytest.mark.parametrize("view", CURVED)
+def test_small_views_are_means_of_areas(folder, view):
+    stripes = np.zeros((*SIZE, 3), np.uint8)
+    stripes[:, ::2] = 255
+    save(folder / "in" / "a.png", stripes)
+    found = read(run(folder, f"--view={view}", "--fov_deg=80", "--size=14,20") / "a.png")
+    fine = shown_by_hand(stripes, view, (14 * 16, 20 * 16), math.radians(80), TURNS[""])
+    means = fine.reshape(14, 16, 20, 16, 3).mean((1, 3))
+    single = shown_by_hand(stripes, view, (14, 20), math.radians(80), TURNS[""])
+    assert np.abs(found - means).mean() < np.abs(single - means).mean() / 3
+
+
+def test_a_panorama_of_a_camera_that_looks_down(folder):
+    out = run(folder, "--view=panorama", "--up=0,0,-1", "--size=40,100")
+    lens = lenses.load(folder / "fisheye.yaml", coefficients="fisheye").with_theta_max(None)
+    view = make_view("panorama", (40, 100), up=(0, 0, -1))
+    found, expected = read(out / "a.png"), undistort(picture(), lens, view)
+    assert np.abs(found.astype(int) - expected).max() <= 3
+    seen = (found.max(-1) > 0).mean(0)
+    assert (seen > 0.4).all()  # in every direction around
 
 
 def test_the_views_show_all_that_the_picture_shows_by_default(folder, capsys):
@@ -121,6 +164,9 @@ def test_the_views_show_all_that_the_picture_shows_by_default(folder, capsys):
         ("perspective", 110, "128 × 96 px"),
         ("cylindrical", 146.7, "128 × 64 px"),
         ("equirectangular", 146.7, "128 × 96 px"),
+        ("mercator", 146.7, "128 × 96 px"),
+        ("stereographic", 146.7, "128 × 96 px"),
+        ("panorama", 360, "128 × 51 px"),
         ("square", 146.7, "96 × 96 px"),
     ):
         run(folder, f"--view={view}", calib="own.json", out=view)
@@ -283,8 +329,14 @@ def test_one_plan_serves_all_pictures_of_one_size(mixed, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["in", "--fov=180"], "--fov_deg must be above 0° and below 180° for a perspective view"),
+        (["in", "--fov=180"], "--fov_deg must be above 0° and at most 179.9° for a pers"),
         (["in", "--view=square", "--fov=361"], "at most 360° for a square view"),
+        (
+            ["in", "--view=square", "--yaw_deg=20"],
+            "--yaw_deg must be 0 for a square view, which looks along the optical axis, got 20",
+        ),
+        (["in", "--view=square", "--up=0,-1,0"], "--up must be left out for a square view"),
+        (["in", "--view=panorama", "--fov=300"], "--fov_deg must be 360° for a panorama view"),
         (["in", "--view=fisheye"], "--view must be one of perspective, cylindrical"),
         (["in", "--yaw_deg=400"], "--yaw_deg must be from -360° to 360°, got 400"),
         (["in", "--theta_max_deg=0"], "--theta_max_deg must be above 0°"),

@@ -247,6 +247,27 @@ def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
 
 
 @pytest.mark.slow
+def test_a_detector_finds_the_same_with_torch_and_without_and_by_the_command(scratch, monkeypatch):
+    scope: dict = {}
+    for block in blocks(ROOT / "docs/tutorials/detector.md"):
+        if block.language == "python":
+            run_python(block.text, scope)
+        else:
+            (command,) = commands(block.text)
+            run_darswin(command[1:], monkeypatch)
+    with_torch = scope["found"]["boxes"][scope["found"]["scores"] > 0.7]
+    alone = scope["there"][scope["best"]]
+    (entry,) = json.loads(Path("found/predictions.json").read_text())
+    by_command = [found["box"] for found in entry["detections"]]
+    assert len(by_command) > 3 and entry["detections"][0]["score"] > 0.5
+    # At the border of the picture, a plan ends where the last point of a box is in it.
+    np.testing.assert_allclose(alone, with_torch, atol=1.5)
+    np.testing.assert_allclose(by_command, alone, atol=0.02)
+    drawn = [cv2.imread(name) for name in ("found.jpg", "without_torch.jpg")]
+    assert all(np.abs(one - cv2.imread("examples/front.jpg")).max() > 100 for one in drawn)
+
+
+@pytest.mark.slow
 def test_the_answers_have_the_numbers_that_their_comments_tell(scratch):
     found = []
     for block in blocks(ROOT / "docs/answers.md"):

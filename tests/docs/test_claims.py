@@ -225,12 +225,13 @@ def test_the_dense_study_shows_its_point():
             if trained_on == band
         }
 
-    wide = over_all_xi("segmentation", "wide")
-    blind = wide.pop("Swin-Unet")
-    assert round(blind) == 32 and {round(score) for score in wide.values()} == {39, 40}
-    measured = over_all_xi("distance", "wide")
-    assert round(measured.pop("Swin-Unet")) == 15
-    assert {round(score) for score in measured.values()} == {36, 37}
+    wide = {label: round(score) for label, score in over_all_xi("segmentation", "wide").items()}
+    assert (wide.pop("Swin-Unet"), wide.pop("Swin-Unet, Mercator")) == (32, 32)
+    assert (wide.pop("U-Net, Mercator"), wide.pop("U-Net, equirectangular")) == (29, 24)
+    assert len(wide) == 4 and set(wide.values()) == {39, 40}
+    measured = {label: round(score) for label, score in over_all_xi("distance", "wide").items()}
+    assert (measured.pop("Swin-Unet"), measured.pop("U-Net, Mercator")) == (15, 39)
+    assert len(measured) == 6 and set(measured.values()) == {36, 37, 38}
     for task in ("segmentation", "distance"):
         low = over_all_xi(task, "low")
         assert max(low, key=low.__getitem__) == "U-Net with rays"

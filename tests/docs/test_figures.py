@@ -14,9 +14,9 @@ from PIL import Image
 
 from darswin import PolarView, create_model
 from darswin.lens import Equidistant
+from darswin.views import make_view
 from darswin.viz import plot
 from darswin.viz.pixels import draw_predictions
-from darswin.viz.views import perspective
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / part) for part in ("docs", "examples", "studies")]
@@ -30,6 +30,7 @@ import lens  # noqa: E402
 import levels  # noqa: E402
 import sizes_tables  # noqa: E402
 import tables  # noqa: E402
+import views  # noqa: E402
 
 SHOWN = sorted(
     {
@@ -50,7 +51,7 @@ def record(path: str) -> dict:
 
 def draw_lens() -> Figure:
     sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
-    return plot.draw_lens(PICTURE, WIDE, sampler, perspective((60, 80), 1.9), "a view")
+    return plot.draw_lens(PICTURE, WIDE, sampler, make_view("tangent", (60, 80), fov=1.9), "a view")
 
 
 def draw_demo() -> Figure:
@@ -78,6 +79,7 @@ RETURNED: dict[str, Callable[[], Figure]] = {
     "levels": levels.draw_levels,
     "metres": lambda: draw_predictions([(PICTURE, METRES, METRES)]),
     "polar": lambda: lens.draw_polar_image(PICTURE, WIDE),
+    "views": views.draw_views,
 }
 WRITTEN: dict[str, Callable[[Path], None]] = {
     "dense curves": draw_dense_curves,

@@ -36,6 +36,8 @@ MODELS = {
     "dat_nano": dict(image_size=64),
     "darswin_unet_a_nano": dict(task="distance"),
     "swin_unet_undis_nano": dict(task="distance", image_size=64),
+    "conv_unet_nano": dict(task="distance", view="mercator", size=48),
+    "swin_unet_nano": dict(image_size=64, view="equirectangular", fov=2.6),
 }
 VIEWS = ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
 CALLS = [

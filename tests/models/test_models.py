@@ -39,6 +39,11 @@ CASES = {name: (name, {}) for name in NANOS} | {
     "official": ("official", {}),
     "feature maps": ("darswin_ra_nano", dict(features_only=True, out_indices=(0, 2))),
     "square view": ("swin_nano", dict(view="square", spacing="g")),
+    "conv_unet_nano mercator": ("conv_unet_nano", dict(view="mercator", size=[36, 28], fov=2.6)),
+    "swin_unet_nano equirectangular distance": (
+        "swin_unet_nano",
+        dict(task="distance", view="equirectangular", size=[64, 96], window=[4, 6], fov=2.6),
+    ),
 }  # fmt: skip
 cases = pytest.mark.parametrize("case", CASES)
 nanos = pytest.mark.parametrize("name", NANOS)
@@ -182,7 +187,7 @@ def test_a_preparation_without_gradients_is_refused_in_training(case):
         lambda prepared: model.run_sampled(sampled, prepared, images),
     )
     has_biases = bool(model.no_weight_decay())
-    assert has_biases == (case != "conv_unet_nano")
+    assert has_biases == ("conv_unet" not in case)
     for run in runs:
         run(prepared)
         model.train()
@@ -213,7 +218,7 @@ def test_the_dtype_of_pixels_that_were_sampled_already(case):
             assert_close(found, model.run(images, prepared), 0.1)
     if model.view.in_pixels:  # such as a camera's undistorted frames
         frames = torch.randint(256, sampled.shape, dtype=torch.uint8)
-        expected = model.run_sampled(model.normalize(frames), prepared)
+        expected = model.run_sampled(model.view.normalized(frames, torch.float32), prepared)
         assert_equal(model.run_sampled(frames, prepared), expected)
 
 

@@ -11,7 +11,7 @@ from darswin.data import WideAngle
 from darswin.data.lens_distributions import PolynomialLenses, SphericalLenses
 from darswin.models import LensAdapter
 from darswin.utils.angles import check_turn, degrees_hint
-from darswin.viz import views
+from darswin.views import make_view, turned
 
 SIZE = (3, 4)
 RNG = np.random.default_rng(0)
@@ -20,12 +20,13 @@ RNG = np.random.default_rng(0)
 @pytest.mark.parametrize(
     ("make", "name", "degrees"),
     [
-        (lambda: views.perspective(SIZE, 90), "fov", 90),
-        (lambda: views.cylindrical(SIZE, 180), "fov", 180),
-        (lambda: views.equirectangular(SIZE, 360), "fov", 360),
-        (lambda: views.perspective(SIZE, 1.0, yaw=-30), "yaw", -30),
-        (lambda: views.cylindrical(SIZE, 1.0, yaw=30), "yaw", 30),
-        (lambda: views.equirectangular(SIZE, 1.0, pitch=45), "pitch", 45),
+        (lambda: make_view("tangent", SIZE, fov=90), "fov", 90),
+        (lambda: make_view("cylindrical", SIZE, fov=180), "fov", 180),
+        (lambda: make_view("equirectangular", SIZE, fov=360), "fov", 360),
+        (lambda: make_view("mercator", SIZE, theta_max=85), "theta_max", 85),
+        (lambda: turned(-30), "yaw", -30),
+        (lambda: turned(yaw=30), "yaw", 30),
+        (lambda: turned(0.5, pitch=45), "pitch", 45),
         (lambda: SphericalLenses(0.2, 0.3).draw(RNG, 170, 32), "fov", 170),
         (lambda: PolynomialLenses().draw(RNG, 170, 32), "fov", 170),
         (lambda: WideAngle(None, SphericalLenses(0, 1), fov=170), "fov", 170),

@@ -9,13 +9,12 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
-from lens_examples import ASIDE, example
+from lens_examples import every_lens
 from scipy.spatial.transform import Rotation
 
 from darswin.lens import Equidistant, KannalaBrandt, Perspective
-from darswin.lens.base import MODELS
 from darswin.views import RayView, TilesView, list_views, make_view, up_of
-from darswin.views.base import _VIEWS
+from darswin.views.registry import _VIEWS
 
 SIZE = (480, 640)
 WIDE = KannalaBrandt(140.0, [0.01], math.radians(95), center=[322.0, 238.0])
@@ -87,21 +86,10 @@ def test_rays_of_pixels_come_back_to_them(name, data):
                                rtol=1e-6, atol=1e-5)  # fmt: skip
 
 
-def lens_of(model):
-    """A lens of each model, and of those with tangential and thin-prism terms, with (H, W)."""
-    if model in ASIDE:
-        cx, cy = ASIDE[model].center[0].tolist()
-        return ASIDE[model], (round(2 * cy), round(2 * cx))
-    lens = example(model, torch.manual_seed(3), (140, 160))[0]
-    return lens.with_theta_max(min(0.95 * lens.theta_max.item(), 1.7)), SIZE
-
-
-@pytest.mark.parametrize(
-    "model", [*sorted(MODELS), *(f"{name}" for name in ASIDE if name not in MODELS)]
-)
 @pytest.mark.parametrize("name", OF_PIXELS)
+@pytest.mark.parametrize("model", every_lens())
 def test_points_go_through_every_lens_and_come_back(name, model):
-    lens, size = lens_of(model)
+    lens, size = every_lens()[model]
     view = make_view(name, size if name == "none" else (200, 200))
     points = np.random.default_rng(0).uniform(5, 195, (300, 2))
     if name == "none":
@@ -336,3 +324,14 @@ def test_angles_and_extrinsics_are_one_or_the_other():
             up_of(extrinsics=wrong)
     with pytest.raises(ValueError, match="one lens, got 2"):
         make_view("mercator", (8, 8)).to_image(np.zeros((1, 2)), Equidistant([9.0, 9.0]), SIZE)
+
+
+@every_ray_view
+def test_a_view_for_one_lens_is_the_same_view(name):
+    lens, other = (Equidistant.from_fov(f, 60.0, image_size=(120, 160)).to(f64) for f in (2.5, 1))
+    view = make_view(name, (40, 50))
+    known, points = view.for_lens(lens, (120, 160)), 160 * torch.rand(9, 2, dtype=f64)
+    for one in (lens, other):
+        found = known.to_view(points, one, (120, 160)), view.to_view(points, one, (120, 160))
+        same = torch.equal(*(points.nan_to_num(-1) for points in found))
+        assert same == (one is lens or name == "panorama")  # which is as wide for all

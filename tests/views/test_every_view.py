@@ -18,7 +18,7 @@ from darswin.views import (
     make_view,
     register_view,
 )
-from darswin.views.base import _VIEWS
+from darswin.views.registry import _VIEWS
 
 LENSES = {
     "two": Spherical.from_fov([0.2, 0.9], 2.6, 24.0),
@@ -182,6 +182,40 @@ def test_a_unet_sees_every_view_and_brings_its_result_back(name):
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", ONE_PICTURE)
+@every_lens
+def test_the_convolutional_unet_sees_pixels_and_rays_of_every_view(name, lens):
+    model = create_model(
+        "conv_unet_nano", widths=(4, 6), view=name, size=32, task="distance"
+    ).eval()
+    plain = create_model("conv_unet_nano", widths=(4, 6), in_chans=6, rays=False, num_classes=1)
+    weights = model.state_dict()
+    plain.load_state_dict({k.replace("distance", "segmentation"): v for k, v in weights.items()})
+    images = torch.rand(lens.count, 3, *SIZE)
+    prepared = model.prepare(lens, SIZE)
+    logits = plain.eval()(torch.cat((model.view.see(images, prepared), prepared.rays), 1))
+    expected = model.head.finish(model.view.back(logits, prepared))
+    assert torch.equal(model(images, lens), expected)
+    assert expected.shape == (lens.count, 1, *SIZE) and expected.std() > 0
+    assert torch.equal(model.run_sampled(model.sample(images, prepared), prepared), expected)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["mercator", "perspective", "polar"])
+def test_a_view_may_have_another_size_than_the_images(name):
+    lens, images = LENSES["two"], torch.rand(2, 3, 32, 32)
+    options = dict(view=name, size=(16, 40), image_size=32, patch_size=2, window=(4, 5))
+    for task in ("segmentation", "distance"):
+        model = create_model(
+            "swin_unet_nano", depths=(1, 1), num_heads=(1, 2), task=task, **options
+        )
+        assert model.eval()(images, lens).shape == (2, model.num_classes, 32, 32)
+        assert model.sample(images, model.prepare(lens, (32, 32))).shape[2:] == (16, 40)
+    with pytest.raises(ValueError, match=r"image_size, \(H, W\) = \(32, 32\), got \(16, 40\)"):
+        model(torch.rand(2, 3, 16, 40), lens)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ONE_PICTURE)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float64])
 def test_networks_of_every_dtype_get_frames_of_uint8_in_their_dtype(name, dtype):
     frames, lens = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8), Equidistant(14.0, 1.2)
@@ -258,6 +292,14 @@ def test_a_view_of_ones_own_has_a_name():
         (lambda: LensAdapter(nn.Identity(), view=make_view("none", (8, 8)), spacing="g", mean=0.0),
          ValueError, "has its own spacing and mean"),
         (lambda: LensAdapter(nn.Identity(), 8, output="maps"), ValueError, "output must be"),
+        (lambda: Swin(image_size=8, size=(8, 16)), ValueError, r"must be image_size = \(8, 8\)"),
+        (lambda: Swin(image_size=32, size=(30, 63), view="mercator"), ValueError,
+         r"patch_size must divide .* = \(30, 63\), got 2"),
+        (lambda: create_model("conv_unet_nano", view="mercator", size=(8, 0)), ValueError,
+         r"size must be at least 1 along both axes, got \(8, 0\)"),
+        (lambda: create_model("conv_unet_nano", view="tiles"), ValueError, "the view shows 5"),
+        (lambda: create_model("conv_unet_nano", view="mercator", spacing="g"), TypeError,
+         "'mercator' has no such option: .*'spacing'"),
         (lambda: View().prepare(None, (8, 8)), NotImplementedError, ""),
     ],
 )  # fmt: skip

@@ -1,5 +1,6 @@
 """Views of frames by darswin.frames: exact bilinear samples, and OpenCV as an oracle."""
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -7,36 +8,69 @@ import numpy as np
 import pytest
 import torch
 from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
+from lens_examples import FRONT
 
 from darswin import frames
 from darswin.lens import Equidistant
-from darswin.viz.views import equirectangular, perspective, undistort
+from darswin.views import SquareView, make_view, turned
+from darswin.viz.views import undistort
+
+VIEWS = {
+    "all inside": make_view("tangent", (40, 50), fov=1.4),
+    "beyond": make_view("equirectangular", (30, 60), fov=2 * math.pi, reads=1),
+    "turned": make_view("cylindrical", (30, 60), fov=2.0, **turned(0.7, -0.4)),
+    "shrunk": make_view("mercator", (12, 20), fov=3.0, up=(0.3, -1, 0.2), reads=3),
+    "square": SquareView((30, 30), theta_max=1.3),
+}
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
-@pytest.mark.parametrize("view", [perspective((40, 50), 1.4), equirectangular((30, 60))])
-def test_views_of_rays_are_exact_pictures(view, channels):
-    lens, frame = ROUND.with_theta_max(1.5), random_frame(64, 70, *channels)
-    found = frames.Sampler(frames.plan(view, lens, (64, 70)))(frame)
-    assert found.dtype == np.uint8 and found.shape == (*view.shape[:2], *channels)
-    x, y = lens.to(torch.float64).project_points(view[None], (64, 70))[0].numpy().transpose(2, 0, 1)
+@pytest.mark.parametrize("name", VIEWS)
+def test_plans_of_views_are_exact_pictures(name, channels):
+    view, lens, frame = VIEWS[name], ROUND.with_theta_max(1.5), random_frame(64, 70, *channels)
+    found = frames.Sampler(frames.plan(view, lens, (64, 70), output="uint8"))(frame)
+    assert found.dtype == np.uint8 and found.shape == (*view.size, *channels)
+    reads, exact = view.reads_of((64, 70)), lens.to(torch.float64)
+    assert reads == (3 if name == "shrunk" else 1)
+    rows, columns = (np.arange(side * reads) + 0.5 for side in view.size)
+    pixels = np.stack(np.meshgrid(columns, rows), -1) / reads - 0.5
+    rays = view.to_rays(torch.from_numpy(pixels)[None], exact, (64, 70))
+    x, y = exact.project_points(rays, (64, 70))[0].numpy().transpose(2, 0, 1)
     x, y = np.where(np.isnan(x), -9, x), np.where(np.isnan(y), -9, y)
-    expected = bilinear(frame.reshape(64, 70, -1), x, y).reshape(found.shape)
+    expected = bilinear(frame.reshape(64, 70, -1), x, y)
+    height, width = view.size
+    expected = expected.reshape(height, reads, width, reads, -1).mean((1, 3)).reshape(found.shape)
     assert np.abs(found - expected).max() <= 0.5 + 1 / 512
-    assert (found == 0).mean() > 0.1 or view.shape[0] == 40  # the lens sees only a part
+    assert (found == 0).mean() > 0.1 or name != "beyond"  # the lens sees only a part
 
 
-def test_views_agree_with_opencv():
+@pytest.mark.parametrize(
+    "view",
+    [
+        make_view("tangent", (60, 80), fov=1.5, **turned(0.2)),
+        make_view("stereographic", (20, 30), fov=2.5, reads=3),
+        make_view("mercator", (17, 25), reads=2),
+    ],
+)
+def test_views_agree_with_opencv(view):
     smooth = cv2.GaussianBlur(random_frame(90, 120, 3), (0, 0), 3)
-    lens, view = Equidistant.from_fov(2.6, 44.0), perspective((60, 80), 1.5, yaw=0.2)
-    found = frames.Sampler(frames.plan(view, lens, (90, 120)))(smooth)
+    lens = Equidistant.from_fov(2.6, 44.0)
+    found = frames.Sampler(frames.plan(view, lens, (90, 120), output="uint8"))(smooth)
     expected = undistort(smooth, lens, view)
+    assert found.shape == expected.shape == (*view.size, 3)
     assert np.abs(found.astype(int) - expected).max() <= 2  # OpenCV's weights have 5 bits
 
 
-def test_rays_can_become_normalized_images_for_any_network():
-    frame, view = random_frame(64, 64, 3), perspective((20, 30), 1.0)
-    plan = frames.plan(view, ROUND, (64, 64), output="image", mean=MEAN, std=STD)
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+def test_places_are_exact_for_lenses_in_single_precision_too(view):
+    size = (966, 1280)
+    exact = frames.plan(view, FRONT.to(torch.float64), size)
+    assert frames.plan(view, FRONT, size) == exact
+
+
+def test_views_can_become_normalized_images_for_any_network():
+    frame, view = random_frame(64, 64, 3), make_view("tangent", (20, 30), fov=1.0)
+    plan = frames.plan(view, ROUND, (64, 64), mean=MEAN, std=STD)
     picture = frames.Sampler(replace(plan, output="uint8"))(frame)
     found = frames.Sampler(plan)(frame)
     expected = (picture / 255 - MEAN) / STD

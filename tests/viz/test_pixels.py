@@ -8,6 +8,7 @@ from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
     distance_range,
+    draw_boxes,
     draw_predictions,
     label_image,
     overlay,
@@ -94,6 +95,22 @@ def test_an_overlay_is_between_both():
     assert (laid == np.where(where[..., None], 125, 100)).all() and laid.dtype == np.uint8
     assert (overlay(image[..., :1], picture) == 150).all()
     assert (overlay(image[..., 0], picture, 1.0) == 200).all()
+
+
+def test_boxes_are_drawn_along_their_outermost_pixels():
+    """The first one on top of others, and a text inside of the picture."""
+    image = np.full((60, 80, 1), 100, np.uint8)
+    boxes = np.array([[10, 30, 30, 50], [10, 20, 50, 50.0]])
+    drawn = draw_boxes(image, boxes, ["", ""], [[255, 0, 0], [0, 0, 255]])
+    assert drawn.shape == (60, 80, 3) and (image == 100).all()
+    assert (drawn[49, 10:30] == [255, 0, 0]).all() and (drawn[30:50, [10, 29]] == [255, 0, 0]).all()
+    assert (drawn[49, 30:50] == [0, 0, 255]).all() and (drawn[20:30, [10, 49]] == [0, 0, 255]).all()
+    assert (
+        (drawn[50:] == 100).all() and (drawn[:, :10] == 100).all() and (drawn[:, 50:] == 100).all()
+    )
+    with_text = draw_boxes(image, boxes[:1] - [[0, 30, 0, 30]], ["a"], [[255, 0, 0]])
+    assert (with_text[1:14, 10:18].max(-1) < 60).any()  # letters
+    assert (draw_boxes(image, np.zeros((0, 4)), [], []) == 100).all()
 
 
 def shown(figure, row=0):

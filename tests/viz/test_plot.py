@@ -9,6 +9,7 @@ from PIL import Image
 
 from darswin import PolarView
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
+from darswin.views import SquareView, make_view, turned
 from darswin.viz.plot import (
     FORMATS,
     draw_accuracy,
@@ -21,7 +22,6 @@ from darswin.viz.plot import (
     figure_format,
     save_figure,
 )
-from darswin.viz.views import equirectangular, perspective
 
 SAMPLER = PolarView(rings=4, sectors=8, samples=(3, 2), layout="image")
 ROUND = Spherical.from_fov(0.4, 2.6, 16.0)
@@ -95,13 +95,48 @@ def test_it_is_hatched_where_there_is_no_picture():
     assert axes.patch.get_hatch()
     (axes,) = drawn(draw_polar, np.zeros((40, 40)), lens, SAMPLER)
     assert (axes.images[0].get_array()[..., 3] == 1).all()
-    rays = equirectangular((45, 90))
-    (axes,) = drawn(draw_view, image, lens, rays)
-    theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
-    place = lens.to(torch.float64).project_rays(theta, torch.atan2(rays[..., 1], rays[..., 0]),
-                                                (20, 60))  # fmt: skip
+    latitude, longitude = torch.deg2rad(4.0 * torch.arange(90) - 4 * torch.tensor([[22], [44.5]]))
+    y, x = torch.meshgrid(latitude[:45].double(), longitude.double(), indexing="ij")
+    theta = torch.acos(y.cos() * x.cos())
+    azimuth = torch.atan2(y.sin(), y.cos() * x.sin())
+    place = lens.to(torch.float64).project_rays(theta, azimuth, (20, 60))
     seen = (theta <= lens.theta_max) & ((place[..., 1] - 9.5).abs() <= 10)
+    view = make_view("equirectangular", (45, 90), fov=2 * math.pi, reads=1)
+    (axes,) = drawn(draw_view, image, lens, view)
     np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
+    # With several reads, a pixel is hatched if it reads nothing.
+    view = make_view("equirectangular", (15, 30), fov=2 * math.pi, reads=3)
+    (axes,) = drawn(draw_view, image, lens, view)
+    some = seen.numpy().reshape(15, 3, 30, 3).any((1, 3))
+    np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, some)
+
+
+@pytest.mark.parametrize("options", [{}, turned(0.7, -0.4), dict(up=(0.5, -1.0, 0.0))])
+@pytest.mark.parametrize("fov", [0.6, 1.7])
+def test_ticks_of_a_view_are_angles_from_its_middle(options, fov):
+    lens, image = Polynomial([20.0, 1.0, 0.5], 1.7), np.zeros((48, 80), np.uint8)
+    for name, place in (
+        ("tangent", lambda angle: 20 / math.tan(fov / 2) * np.tan(angle)),
+        ("equirectangular", lambda angle: 40 / fov * angle),
+        ("stereographic", lambda angle: 20 / math.tan(fov / 4) * np.tan(angle / 2)),
+    ):
+        view = make_view(name, (30, 40), fov=fov, **options)
+        (axes,) = drawn(draw_view, image, lens, view)
+        for axis, half, sign in ((axes.xaxis, 19.5, 1), (axes.yaxis, 14.5, -1)):
+            shown = [float(text.get_text()[:-1]) for text in axis.get_ticklabels()]
+            assert len(shown) >= 3 and 0 in shown
+            expected = half + sign * place(np.radians(shown))
+            np.testing.assert_allclose(axis.get_ticklocs(), expected, atol=0.05)
+
+
+def test_ticks_of_the_square_and_of_views_without_any():
+    lens, image = Polynomial([20.0, 1.0, 0.5], 1.7), np.zeros((48, 80), np.uint8)
+    (axes,) = drawn(draw_view, image, lens, SquareView((41, 41), theta_max=1.2))
+    shown = [float(text.get_text()[:-1]) for text in axes.xaxis.get_ticklabels()]
+    expected = 20 + 20.5 * np.radians(shown) / 1.2
+    np.testing.assert_allclose(axes.xaxis.get_ticklocs(), expected, atol=0.05)
+    with pytest.raises(ValueError, match="a view of one picture, got 5"):
+        drawn(draw_view, image, lens, make_view("tiles", (20, 20)))
 
 
 def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
@@ -133,7 +168,7 @@ def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
 def test_draw_lens_has_all_panels(tmp_path):
     image = np.zeros((48, 64, 3), np.uint8)
     lens = KannalaBrandt(20.0, [0.01], 1.7)
-    figure = draw_lens(image, lens, SAMPLER, perspective((6, 8), 1.0), "ahead")
+    figure = draw_lens(image, lens, SAMPLER, make_view("tangent", (6, 8), fov=1.0), "ahead")
     assert len(figure.axes) == 6  # five panels, and the second scale of the curve
     heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
              "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip

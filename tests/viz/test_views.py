@@ -1,27 +1,46 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from lens_examples import FRONT
+from scipy.spatial.transform import Rotation
 
 from darswin.lens import KannalaBrandt, Mei, Perspective
 from darswin.lens.pixels import OUTSIDE
-from darswin.viz.views import (
-    cylindrical,
-    equirectangular,
-    perspective,
-    rotated,
-    undistort,
-    view_map,
-)
+from darswin.views import PlainView, PolarView, SquareView, make_view, turned
+from darswin.viz.views import undistort, view_map
 
+
+def by_hand(name, size, fov, yaw=0.0, pitch=0.0):
+    """The rays of the pixels of a view, unit vectors (H, W, 3), by formulas; NaN beyond a pole."""
+    step = 2 * math.tan(fov / 2) / size[1] if name == "tangent" else fov / size[1]
+    v, u = np.indices(size)
+    x, y = (u - (size[1] - 1) / 2) * step, (v - (size[0] - 1) / 2) * step
+    if name == "tangent":
+        rays = np.stack((x, y, np.ones_like(x)), -1)
+    elif name == "cylindrical":
+        rays = np.stack((np.sin(x), y, np.cos(x)), -1)
+    else:
+        rays = np.stack((np.cos(y) * np.sin(x), np.sin(y), np.cos(y) * np.cos(x)), -1)
+        rays[np.abs(y) > math.pi / 2] = math.nan
+    turn = Rotation.from_euler("YX", [yaw, pitch]).as_matrix()  # pitched, then turned
+    return F.normalize(torch.from_numpy(rays @ turn.T), dim=-1)
+
+
+# Their names, sizes, fields of view, yaw and pitch.
 VIEWS = {
-    "perspective": perspective((60, 80), math.radians(100)),
-    "aside": perspective((60, 80), math.radians(70), yaw=0.8, pitch=-0.3),
-    "cylindrical": cylindrical((60, 160), math.radians(180)),
-    "equirectangular": equirectangular((90, 180)),
+    "tangent": ("tangent", (60, 80), math.radians(100)),
+    "aside": ("tangent", (60, 80), math.radians(70), 0.8, -0.3),
+    "cylindrical": ("cylindrical", (60, 160), math.radians(180)),
+    "equirectangular": ("equirectangular", (90, 180), 2 * math.pi),
 }
+
+
+def made(name, size, fov, yaw=0.0, pitch=0.0, **options):
+    return make_view(name, size, fov=fov, **turned(yaw, pitch), **options)
 
 
 def front():
@@ -66,21 +85,26 @@ def test_a_view_shows_what_lies_along_its_rays(make):
     lens = make().resized(0.25)  # so that half a pixel is more than the tolerance
     image = photograph(lens)
     last = torch.tensor(image.shape[::-1]) - 1
-    for name, rays in VIEWS.items():
+    for name, described in VIEWS.items():
+        rays = by_hand(*described)
         theta, azimuth = angles(rays)
         there = lens.project_rays(theta, azimuth)
         inside = (theta < lens.theta_max - 0.04) & ((there >= 0) & (there <= last)).all(-1)
         assert inside.double().mean() > 0.4, name
         # Bilinear between pixels, of places that OpenCV rounds to 1/32 px.
-        error = np.abs(undistort(image, lens, rays) - scene(rays))[inside]
+        shown = undistort(image, lens, made(*described, reads=1))
+        error = np.abs(shown - scene(rays))[inside]
         assert error.max() < 5e-4, name
 
 
 @pytest.mark.parametrize("make", [front, mei, skewed])
 def test_rays_land_where_the_lens_projects_them(make):
-    lens, rays = make(), VIEWS["equirectangular"]
+    lens, described = make(), VIEWS["equirectangular"]
+    rays = by_hand(*described)
     theta, azimuth = angles(rays)
-    there, beyond = view_map(lens, rays), (theta > lens.theta_max).numpy()
+    size = tuple(lens.image_size[0].int().tolist())
+    there = view_map(lens, made(*described, reads=1), size)
+    beyond = (theta > lens.theta_max).numpy()
     assert 0 < beyond.mean() < 1 and (there[beyond] == OUTSIDE).all()
     expected = lens.project_rays(theta, azimuth).numpy()
     np.testing.assert_allclose(there[~beyond], expected[~beyond], atol=1e-3)
@@ -89,63 +113,77 @@ def test_rays_land_where_the_lens_projects_them(make):
 def test_behind_the_camera_is_black():
     lens = front()
     image = np.ones((966, 1280), np.float32)
-    assert not undistort(image, lens, perspective((20, 20), 1.0, yaw=math.pi)).any()
-    around = undistort(image, lens, equirectangular((91, 181)))
+    around = undistort(image, lens, made("equirectangular", (91, 181), 2 * math.pi))
     assert around[45, 90] == 1 and not around[:, :20].any() and not around[:, -20:].any()
-    assert not undistort(image, lens, torch.zeros(4, 4, 3)).any()
+    with pytest.raises(ValueError, match="this view sees nothing of the lens"):
+        undistort(image, lens, made("tangent", (20, 20), 1.0, math.pi))
 
 
-@pytest.mark.parametrize("make", [perspective, cylindrical, equirectangular])
-def test_yaw_looks_right_and_pitch_up(make):
-    def middle(**turn):
-        return make((3, 5), 1.0, **turn)[1, 2]
-
-    def direction(*xyz):
-        return torch.tensor(xyz, dtype=torch.float64)
-
-    torch.testing.assert_close(middle(), direction(0, 0, 1))
-    right = direction(math.sin(0.3), 0, math.cos(0.3))
-    torch.testing.assert_close(middle(yaw=0.3), right)
-    torch.testing.assert_close(middle(pitch=0.3), direction(0, -math.sin(0.3), math.cos(0.3)))
-    # The horizon stays level: rotated by yaw, a pitched view looks as far up as before.
-    both = middle(yaw=1.2, pitch=0.3)
-    torch.testing.assert_close(both[1], middle(pitch=0.3)[1])
-    torch.testing.assert_close(both, rotated(direction(0, 0, 1), 1.2, 0.3))
+TURNS = ((0.0, 0.0), (0.4, -0.2), (1.2, 0.3), (math.pi, 0.1), (-math.pi, -0.4),
+         (0.0, math.pi / 2), (0.7, -math.pi / 2), (2 * math.pi, 2.5))  # fmt: skip
 
 
-def test_fields_of_view_are_between_the_pixels_edges():
-    def longitude(rays):
-        return torch.atan2(rays[..., 0], rays[..., 2])
+@pytest.mark.parametrize("name", ["tangent", "cylindrical", "equirectangular"])
+@pytest.mark.parametrize("turn", TURNS)
+def test_rays_are_those_of_formulas_and_turn(name, turn):
+    """Fields of view are between the outer edges of pixels; yaw looks right, and pitch up."""
+    for size, fov in (((4, 6), 1.4), ((9, 8), 3.0), ((9, 8), 2 * math.pi)):
+        if name == "tangent" and fov > 3:
+            continue
+        grid = torch.from_numpy(np.stack(np.indices(size)[::-1], -1)).double()
+        rays = made(name, size, fov, *turn).to_rays(grid[None], front(), (966, 1280))[0]
+        torch.testing.assert_close(rays, by_hand(name, size, fov, *turn), equal_nan=True)
+    middle = by_hand(name, (3, 5), 1.0, *turn)[1, 2]
+    yaw, pitch = turn
+    right, above = math.cos(pitch) * math.sin(yaw), -math.sin(pitch)
+    assert middle.tolist() == pytest.approx([right, above, math.cos(pitch) * math.cos(yaw)])
 
-    rays = perspective((4, 6), 1.4)
-    torch.testing.assert_close(rays[0, -1, 0], torch.tensor(5 / 6 * math.tan(0.7)).double())
-    torch.testing.assert_close(rays[0].diff(dim=0)[:, 0], rays[:, 0, 1].diff()[:1].expand(5))
-    for make in (cylindrical, equirectangular):
-        row = longitude(make((4, 6), 1.4))[2]
-        torch.testing.assert_close(row, (torch.arange(6.0).double() - 2.5) * 1.4 / 6)
-    sphere = equirectangular((4, 8))
-    latitude = torch.asin(sphere[:, 0, 1])
-    torch.testing.assert_close(latitude, (torch.arange(4.0).double() - 1.5) * math.pi / 4)
-    assert not equirectangular((9, 8))[[0, -1]].any() and equirectangular((9, 8))[4].any()
+
+def test_a_view_that_shrinks_is_the_mean_of_areas():
+    """As more points have it, and OpenCV's reduction of a flat picture."""
+    lens, noise = front(), np.random.default_rng(0).random((966, 1280)).astype(np.float32)
+    described = ("tangent", (30, 40), 1.5)
+    fine = undistort(noise, lens, made(described[0], (30 * 16, 40 * 16), 1.5, reads=1))
+    means = fine.reshape(30, 16, 40, 16).mean((1, 3))
+    single = np.abs(undistort(noise, lens, made(*described, reads=1)) - means).mean()
+    assert np.abs(undistort(noise, lens, made(*described)) - means).mean() < single / 3
+    flat = Perspective(60.0, 1.2, image_size=(60, 80))
+    picture = (noise[:60, :80] * 255).astype(np.uint8)
+    reduced = undistort(picture, flat, made("tangent", (30, 40), 2 * math.atan(40 / 60), reads=2))
+    expected = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA)
+    assert reduced.dtype == np.uint8 and np.abs(reduced.astype(int) - expected).max() <= 1
 
 
 def test_colours_and_types():
     lens = front()
     image = np.random.default_rng(0).integers(256, size=(966, 1280, 3), dtype=np.uint8)
-    view = undistort(image, lens, VIEWS["perspective"])
+    view = undistort(image, lens, made(*VIEWS["tangent"]))
     assert view.shape == (60, 80, 3) and view.dtype == np.uint8
     small = Perspective(10.0, 1.2)  # no principal point of its own: that of the image
     picture = np.arange(35, dtype=np.float32).reshape(5, 7)
-    same = undistort(picture, small, perspective((5, 7), 2 * math.atan(0.35)))
+    same = undistort(picture, small, made("tangent", (5, 7), 2 * math.atan(0.35)))
     np.testing.assert_allclose(same, picture, atol=1e-3)
 
 
+def test_tiles_and_squares():
+    lens, image = front(), np.random.default_rng(0).random((966, 1280, 3)).astype(np.float32)
+    tiles = make_view("tiles", (32, 40), count=4)
+    shown = undistort(image, lens, tiles)
+    assert shown.shape == (4 * 32, 40, 3)
+    for k, tile in enumerate(tiles.tiles):
+        np.testing.assert_array_equal(shown[k * 32 : k * 32 + 32], undistort(image, lens, tile))
+    square = SquareView((50, 50), theta_max=1.5)
+    seen = square(torch.from_numpy(image)[None].movedim(-1, 1).double(), lens)[0]
+    found = undistort(image, lens, square)
+    np.testing.assert_allclose(found, seen.movedim(0, -1), atol=0.05)
+
+
 def test_errors():
+    view = make_view("tangent", (4, 4), fov=1.0)
     with pytest.raises(ValueError, match="one lens, got 2"):
-        view_map(Perspective([10.0, 20.0], 1.0), torch.zeros(2, 2, 3), (4, 4))
-    with pytest.raises(ValueError, match=r"\(H, W, 3\), got \(2, 2\)"):
-        view_map(Perspective(10.0, 1.0), torch.zeros(2, 2), (4, 4))
-    for make, fov, range_ in ((perspective, math.pi, "below π"), (cylindrical, 7.0, "at most 2π"),
-                              (equirectangular, 0.0, "at most 2π")):  # fmt: skip
-        with pytest.raises(ValueError, match=f"fov must be above 0 and {range_} rad, got {fov}"):
-            make((4, 4), fov)
+        view_map(Perspective([10.0, 20.0], 1.0), view, (4, 4))
+    with pytest.raises(ValueError, match="lens belongs to images of"):
+        view_map(front(), view, (4, 4))
+    for wrong in (torch.zeros(2, 2, 3), PlainView(None), PolarView(4, 8, (2, 2))):
+        with pytest.raises(TypeError, match="view must have pixels along rays, as a RayView, got"):
+            view_map(Perspective(10.0, 1.0), wrong, (4, 4))

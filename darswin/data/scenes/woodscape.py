@@ -3,7 +3,8 @@
 WoodScape has labels of ten classes. The reader uses `rgb_images/`,
 `semantic_annotations/[semantic_annotations/]gtLabels/`, the classes of `seg_annotation_info.json`
 beside it, and `calibration/[calibration/]` or `calibration_data/calibration/`. It does not read
-boxes, polygons, motion, soiling, previous images and the test set, whose labels are not public.
+polygons, motion, soiling, previous images and the test set, whose labels are not public.
+`darswin.data.labels` reads the boxes.
 
 SynWoodScape has the same four cameras in a simulator, with labels of 25 classes and distances. The
 reader uses `rgb_images/[rgb_images/]`, `semantic_annotations/[semantic_annotations/]gtLabels/`,
@@ -14,14 +15,13 @@ Source: Yogamani et al., WoodScape, ICCV 2019, and github.com/valeoai/WoodScape;
 SynWoodScape, RA-L 2022.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from darswin.data.cameras import Calibrations
-from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictures_in, stems
+from darswin.data.scenes.files import Options, lenses_beside, pair, pictures_in, stems
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes
 from darswin.data.scenes.targets import read_distance, read_labels
 from darswin.data.splits import Split
@@ -72,20 +72,22 @@ def _scenes(
 ) -> Scenes:
     target = options.target
     if target == "labels":
-        targets = stems(_unnested(root / "semantic_annotations") / "gtLabels", (".png",))
+        targets = stems(unnested(root / "semantic_annotations") / "gtLabels", (".png",))
         class_of, classes = options.labels(partial(_classes, root, names), ids=range(len(names)))
         read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     else:
-        targets = stems(_unnested(root / "depth_maps") / "raw_data", (".npy",))
+        targets = stems(unnested(root / "depth_maps") / "raw_data", (".npy",))
         classes, read = NO_CLASSES, partial(read_distance, far=SKY)
     pairs = pair(
-        pictures_in(_unnested(root / "rgb_images")),
+        pictures_in(unnested(root / "rgb_images")),
         targets,
         lambda found: options.choose(found, root, named={"heal-swin": heal_swin}),
         root=root,
         what=target,
     )
-    lenses = options.given_lens(root) or _lenses(root, pairs, options)
+    lenses = options.given_lens(root) or lenses_beside(
+        options, root, pairs, calibration_files(root)
+    )
     return Scenes(
         root, list(pairs.values()), lenses, target=target, classes=classes,
         views=[_view_of(stem) for stem in pairs], read=read, trim=trim,
@@ -110,7 +112,7 @@ def _view_of(stem: str) -> str:
     return stem.rsplit("_", 1)[-1]
 
 
-def _unnested(folder: Path) -> Path:
+def unnested(folder: Path) -> Path:
     """The folder, or a folder of the same name in it, because some archives unpack so."""
     inner = folder / folder.name
     return inner if inner.is_dir() else folder
@@ -141,9 +143,9 @@ def _info(file: Path) -> Classes:
     return Classes([classes.names[k] for k in order], colors)
 
 
-def _lenses(root: Path, pairs: Pairs, options: Options) -> Calibrations:
-    """The calibrations of the pictures, or else those of their cameras."""
-    places = _unnested(root / "calibration"), root / "calibration_data" / "calibration"
+def calibration_files(root: Path) -> Callable[[str], str]:
+    """A function from the stem of a picture to its calibration, or else that of its camera."""
+    places = unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:
         text = f"no folder {places[0]} or {places[1]}: give `lens`"
@@ -153,4 +155,4 @@ def _lenses(root: Path, pairs: Pairs, options: Options) -> Calibrations:
     def calibration_of(stem: str) -> str:
         return found.get(stem) or found.get(_view_of(stem)) or f"{folder / stem}.json"
 
-    return lenses_beside(options, root, pairs, calibration_of)
+    return calibration_of

@@ -1,0 +1,215 @@
+"""Predictions of a network in an ONNX file, which sees the pictures through a view."""
+
+import io
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+
+from darswin import boxes
+from darswin.cli.answers import Answers, file_of, label_png, said, write_overlay
+from darswin.cli.views import named_view
+from darswin.data.scenes.targets import IGNORE
+from darswin.data.splits import read_list
+from darswin.deploy.network import Detections, OnnxNetwork
+from darswin.frames import Plan, Sampler, plan
+from darswin.lens import Lens
+from darswin.ops.checks import per_channel
+from darswin.utils.files import replace_file
+from darswin.utils.image import BrokenImageError
+from darswin.utils.parameters import check, naming
+from darswin.views import PlainView
+from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
+
+VIEW, THRESHOLD = "mercator", 0.3
+
+
+class Seen(NamedTuple):
+    """The view of the pictures of one camera."""
+
+    sampler: Sampler
+    lens: Lens  # float64
+    back: Any  # what the view prepares for maps; None for others
+
+
+class NetworkAnswers(Answers):
+    """Carries what a network finds in a view to the pictures.
+
+    Args: those of `darswin predict` with these names.
+
+    Raises:
+        ValueError: an option is wrong, or does not fit the view or the network.
+    """
+
+    most_lenses = 8  # a plan of tiles takes 100 MB
+
+    def __init__(
+        self, network: str, *, view: str | None = None, size: tuple[int, int] | None = None,
+        fov_deg: float | None = None, up: Sequence[float] | None = None,
+        mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
+        channels: str | None = None, threshold: float | None = None, labels: str | None = None,
+    ):  # fmt: skip
+        lowest = THRESHOLD if threshold is None else threshold
+        for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
+            given = ",".join(f"{value:g}" for value in values)
+            check(name, given, all(map(math.isfinite, values)), "finite")
+        make = partial(
+            named_view, "view", view or VIEW, fov_deg=fov_deg, up=up, mean=mean or (0.0,),
+            std=std or (1.0,),
+        )  # fmt: skip
+        # The network says how large its pictures are, but the view how many there are.
+        try:
+            self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
+        except ModuleNotFoundError as error:  # of onnxruntime, and says how to install it
+            raise ValueError(str(error)) from error
+        super().__init__(self.network.channels)
+        if self.network.output == "uint8" and (mean or std):
+            text = f"{network} takes pixels of uint8: leave `mean` and `std` out"
+            raise naming(ValueError(text), "mean", "std")
+        self.view = make(self.network.size)
+        self._mean, self._std = (
+            per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
+        )
+        self.labels = None if labels is None else read_list(labels)
+        self._step = -1 if channels == "bgr" else 1
+
+    def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
+        """Says where files go, which numbers do not need; names: those of `file_names`."""
+        self._out, self._names = out or Path(), names
+        return self
+
+    def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
+        try:
+            seen: Seen = self._once(lens, lambda: self._seen(image.shape[:2], lens))
+        except ValueError as error:
+            raise BrokenImageError(f"{said(entry)} has no such view: {error}") from error
+        pictures = seen.sampler(image[..., :: self._step])
+        start = time.perf_counter()
+        try:
+            found = self.network(pictures)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"no prediction for {said(entry)}: {error}") from error
+        self.seconds += time.perf_counter() - start
+        if isinstance(found, list):
+            answer = self._detections(entry, image, seen, found)
+        else:
+            answer = self._outputs(entry, image, seen, found)
+        self.found.append(entry | answer)
+
+    def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
+        lens, back = lens.detach().to(torch.float64), None
+        if not isinstance(self.view, PlainView):
+            made = plan(
+                self.view, lens, size, output=self.network.output, mean=self._mean, std=self._std
+            )
+        elif size == self.network.size:
+            rows, columns = np.indices(size, np.int16)
+            zeros = np.zeros(size, np.float32)
+            made = Plan(
+                columns, rows, zeros, zeros, size, self.network.output, self._mean, self._std
+            )
+        else:
+            (height, width), (own_height, own_width) = size, self.network.size
+            raise ValueError(
+                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}: "
+                "choose a view that resamples it"
+            )
+        if (made.columns < -1).all():
+            raise ValueError("it shows nothing of the picture: choose another, or check the lens")
+        if self.network.kind == "maps":
+            with torch.inference_mode():
+                back = self.view.prepare(lens, size, rays=False)
+        return Seen(Sampler(made), lens, back)
+
+    def _detections(
+        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
+    ) -> dict[str, Any]:
+        """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
+        size, parts = image.shape[:2], []
+        for tile, (inner, *others) in enumerate(found):
+            inner = boxes.clip(inner, self.network.size)
+            carried, visible = boxes.carry(inner, partial(seen.sampler.plan.points, tile=tile))
+            kept = (inner[:, :2] < inner[:, 2:]).all(1) & (visible > 0)
+            parts.append([values[kept] for values in (carried, visible, *others)])
+        carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
+        carried = boxes.clip(carried, size)
+        if len(found) == 1:  # a network knows best which of its own boxes are one thing
+            order = np.argsort(-scores, kind="stable")
+        else:
+            order = boxes.merge(carried, scores, labels)
+        carried, visible, scores, labels = (v[order] for v in (carried, visible, scores, labels))
+
+        def to_rays(points: np.ndarray) -> np.ndarray:
+            return seen.lens.unproject_points(torch.from_numpy(points)[None], size)[0].numpy()
+
+        there = boxes.spherical(carried, to_rays)
+        names = [self._name(label) for label in labels.tolist()]
+        colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
+        texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
+        picture = draw_boxes(image, carried, texts, colors)
+        columns = {
+            "label": names,
+            "score": _rounded(scores, 4),
+            "box": _rounded(carried, 2),
+            "visible": _rounded(visible, 4),
+            **{
+                f"{angle}_deg": _rounded(np.degrees(getattr(there, angle)), 3)
+                for angle in ("azimuth", "elevation", "width", "height")
+            },
+            "ray": _rounded(there.ray, 6),
+        }
+        entries = [
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+        ]
+        name = file_of(entry, self._names)
+        return {"overlay": write_overlay(self._out, name, picture), "detections": entries}
+
+    def _name(self, label: int) -> str | int:
+        """The name of a class, or its number if there are no names."""
+        if self.labels is None:
+            return label
+        if not 0 <= label < len(self.labels):
+            text = f"{self.network.path} found class {label}, but `labels` has {len(self.labels)}"
+            raise naming(ValueError(f"{text} names, from 0"), "labels")
+        return self.labels[label]
+
+    def _outputs(
+        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        """Writes maps at the size of the picture; numbers are part of the answer."""
+        answer: dict[str, Any] = {}
+        for output, values in found.items():
+            if values.ndim < 4:
+                answer[output] = (values[0] if len(values) == 1 else values).tolist()
+                continue
+            folder = re.sub(r"[^\w.-]", "_", output)
+            name = f"{folder}/{file_of(entry, self._names)}"
+            seen_pixels = np.ones_like(values[:, :1])
+            maps = torch.from_numpy(np.concatenate((values, seen_pixels), 1)).float()
+            with torch.inference_mode():
+                *planes, reached = self.view.back(maps, seen.back)[0].numpy()
+            content = io.BytesIO()
+            np.save(content, np.stack(planes))
+            replace_file(self._out / f"maps/{name}.npy", content.getbuffer())
+            answer[output] = {"map": f"maps/{name}.npy"}
+            if 2 <= len(planes) <= IGNORE:
+                labels = np.where(reached > 0.5, np.argmax(planes, 0), IGNORE).astype(np.uint8)
+                colors = palette(len(planes))
+                replace_file(self._out / f"labels/{name}.png", label_png(labels, colors))
+                laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
+                answer[output]["labels"] = f"labels/{name}.png"
+                answer[output]["overlay"] = write_overlay(self._out, name, laid)
+        return answer
+
+
+def _rounded(values: Any, digits: int) -> Any:
+    """Numbers in lists for JSON, which has no NaN."""
+    if np.ndim(values):
+        return [_rounded(value, digits) for value in values]
+    return None if math.isnan(values) else round(values, digits)

@@ -1,0 +1,336 @@
+"""`darswin warp`: a data set, pictures and labels, as another lens or a view sees it."""
+
+import json
+import multiprocessing
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from darswin.boxes import carry_mask
+from darswin.cli.predict import is_below
+from darswin.cli.views import named_view, to_corners
+from darswin.data.cameras import Calibrations, is_json
+from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
+from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Move, move_things
+from darswin.data.labels.yolo import is_yolo
+from darswin.data.reframing import Warped
+from darswin.data.warping import picture_size
+from darswin.lens import Lens, save, to_dict
+from darswin.lens.files.load import Calibration
+from darswin.lens.files.opencv import Coefficients
+from darswin.utils.files import remove_partial_files, replace_file
+from darswin.utils.image import (
+    BrokenImageError,
+    read_header,
+    read_oriented,
+    write_image,
+    written_as,
+)
+from darswin.utils.parameters import check, naming, with_flags
+from darswin.utils.processes import die_with_parent
+from darswin.utils.progress import Progress
+from darswin.utils.text import read_json
+from darswin.views import PixelView, RayView, list_views
+
+RECORD, LENS, VIEW, LEFT = "warp.json", "lens.json", "view.json", "left.json"
+COCO, PICTURES = "annotations.json", "images"
+_SIZE = (512, 512)  # of a view
+_NAMED = 10  # pictures that cannot be read
+_KEPT = 8  # lenses whose maps are in memory
+
+
+def warp(
+    source: str, *, to: str, out: str, lens: str | None = None, size: tuple[int, int] | None = None,
+    fov_deg: float | None = None, up: Sequence[float] | None = None, pictures: str | None = None,
+    camera: str | None = None, coefficients: Coefficients | None = None, processes: int = 1,
+) -> None:  # fmt: skip
+    """Writes a data set, its pictures and labels, as another lens or a view sees it.
+
+    Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. Things
+    of which less than a fifth is visible in the new picture are left out and listed in left.json.
+    The same command goes on where an earlier run was stopped. Pictures that cannot be read are
+    named at the end; all others are written.
+
+    Args:
+        source: a COCO file of instances or keypoints; or a folder in the form of YOLO, or of
+            WoodScape with its boxes.
+        to: the calibration file of the new camera, or its lens as JSON, see --lens; or a view, such
+            as mercator or tiles:5, with the number of tiles.
+        out: the folder to write to: new, empty, or from an earlier run of the same command. It gets
+            the pictures, annotations.json in COCO's form or the text files of YOLO if the source
+            has them, and lens.json, the new camera, or view.json, the view.
+        lens: the calibration file of the camera that took the pictures, in any format that
+            `darswin.lens.load` reads; or a lens as JSON, such as {"model": "Perspective",
+            "fov_deg": 60}; or a lenses.json for several cameras. The default is a lens.json beside
+            the labels, and the calibrations of WoodScape.
+        size: height and width of the new pictures in px, e.g. 480,640. The default is the size of
+            the new camera, and 512,512 for views.
+        fov_deg: the horizontal field of view of a view, in degrees. The default is all that the
+            lens sees.
+        up: the direction away from gravity in the camera's frame, for views: x to the right, y
+            down, z forward. The default is the top of the picture, 0,-1,0.
+        pictures: the folder of the pictures, if a COCO file does not lie where COCO has it.
+        camera: the name or number of the camera, if the calibration of --lens has several.
+        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
+        processes: the number of processes that work at the same time.
+    """
+    check("processes", processes, processes >= 1, "at least 1")
+    check("size", size, size is None or min(size) >= 1, "at least 1,1")
+    target = _target(to, size, fov_deg, up)
+    data = open_labels(source, pictures)
+    if lens is not None:
+        root = "." if is_json(lens) else data.folder
+        data.lenses = Calibrations(lens, root, camera, coefficients)
+    if data.lenses is None:
+        text = f"missing `lens`: {source} has no calibration, so give that of its camera"
+        raise naming(ValueError(text), "lens")
+    if is_below(out, source):
+        raise ValueError(f"--out must be a folder outside of {source}, got {out}")
+    in_yolo = is_yolo(Path(source))
+    settings = dict(
+        source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
+        camera=camera, coefficients=coefficients,
+        target=to_dict(target) if isinstance(target, Lens) else None,
+    )  # fmt: skip
+    folder = _claim(out, settings)
+    work = _Work(replace(data, files=(), raw=(), entries=()), target,
+                 folder if in_yolo else folder / PICTURES)  # fmt: skip
+    found: list[_Warped] = []
+    with Progress("warp", len(data)) as progress, _pool(work, processes) as each:
+        for one in each(data.files, data.raw):
+            found.append(one)
+            progress.done += 1
+    _write(folder, data, target, found, in_yolo, settings)
+
+
+class _Warped(NamedTuple):
+    """What became of a picture: its new files and their labels, the things that left, and the lens
+    that took it, as JSON; or an error."""
+
+    pictures: Sequence[tuple[str, Labels]] = ()
+    left: Sequence[Thing] = ()
+    lens: str = ""
+    error: str = ""
+
+
+class _InView:
+    """A picture as a view, or a tile of it, shows it: a `Move`."""
+
+    mirrored = False
+
+    def __init__(self, view: PixelView, lens: Lens, old: tuple[int, int], tile: int):
+        assert view.size is not None
+        self.size, self._lens, self._old = view.size, lens.to(torch.float64), old
+        self._view = view.for_lens(self._lens, old) if isinstance(view, RayView) else view
+        self._tile = {"tile": tile} if view.count > 1 else {}
+
+    def to_new(self, points: np.ndarray) -> np.ndarray:
+        return self._view.to_view(points, self._lens, self._old, **self._tile)
+
+    def target(self, target: np.ndarray) -> np.ndarray:
+        return carry_mask(target, lambda _: self._places, self.size)
+
+    @cached_property
+    def _places(self) -> np.ndarray:
+        y, x = np.mgrid[: self.size[0], : self.size[1]].astype(float)
+        return self._view.to_image(np.stack((x, y), -1), self._lens, self._old, **self._tile)
+
+
+class _Maps:
+    """What pictures of one lens become: pictures of another lens, or of a view."""
+
+    def __init__(self, lens: Lens, target: Lens | PixelView):
+        self.lens, self.seen, old = lens, to_corners(lens), picture_size(lens)
+        self.said = json.dumps(to_dict(self.seen))
+        if isinstance(target, Lens):
+            warped = Warped(self.seen, target)
+            self.moves: list[Move] = [warped]
+            self.images = lambda image: [warped.image(image)]
+            return
+        self.moves = [_InView(target, self.seen, old, k) for k in range(target.count)]
+        prepared = target.prepare(self.seen, old, back=False, rays=False)
+
+        def images(image: np.ndarray) -> list[np.ndarray]:
+            seen = target.see(torch.from_numpy(image.transpose(2, 0, 1).copy())[None], prepared)
+            return [*(seen * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()]
+
+        self.images = images
+
+
+@dataclass
+class _Work:
+    """Writes the new pictures of a picture, unless they are there, and moves its labels."""
+
+    data: LabelledPictures
+    target: Lens | PixelView
+    folder: Path
+    maps: dict[int, _Maps] = field(default_factory=dict)
+
+    def __call__(self, file: str, raw: Any) -> _Warped:
+        try:
+            return self._warped(file, raw)
+        except (BrokenImageError, ValueError) as error:
+            said = with_flags(error)
+            return _Warped(error=said if file in said else f"{file}: {said}")
+
+    def _warped(self, file: str, raw: Any) -> _Warped:
+        assert self.data.lenses is not None
+        name = self.data.folder / file
+        header = read_header(name)
+        labels = self.data.read(raw, header.upright)
+        maps = self._maps_of(self.data.lenses.lens_of(name, header.upright, header.orientation))
+        new = written_as(Path(file))
+        tiles = [f"_{k}" for k in range(len(maps.moves))] if len(maps.moves) > 1 else [""]
+        files = [str(new.with_stem(new.stem + tile)) for tile in tiles]
+        if not all((self.folder / file).is_file() for file in files):
+            image, orientation = read_oriented(name, header.channels)
+            if (image.shape[:2], orientation) != (header.upright, header.orientation):
+                raise BrokenImageError(
+                    f"cannot read {name}: its orientation stands behind its pixels"
+                )
+            for file, picture in zip(files, maps.images(image), strict=True):
+                write_image(self.folder / file, picture)
+        moved = [move_things(labels.things, move) for move in maps.moves]
+        left = [
+            thing for thing, *tiles in zip(labels.things, *moved, strict=True)
+            if all(found is None for found in tiles)
+        ]  # fmt: skip
+        shown = [
+            Labels([thing for thing in things if thing is not None], move.size)
+            for things, move in zip(moved, maps.moves, strict=True)
+        ]
+        return _Warped([*zip(files, shown, strict=True)], left, maps.said)
+
+    def _maps_of(self, lens: Lens) -> _Maps:
+        if id(lens) not in self.maps:
+            if len(self.maps) == _KEPT:
+                del self.maps[next(iter(self.maps))]
+            self.maps[id(lens)] = _Maps(lens, self.target)
+        return self.maps[id(lens)]  # it keeps the lens, and so its identity
+
+
+@contextmanager
+def _pool(work: _Work, processes: int) -> Iterator[Callable[..., Iterable[_Warped]]]:
+    """A `map` of the work, in this process or in several."""
+    if processes == 1:
+        yield partial(map, work)
+        return
+    # Forks of a process whose threads have computed may hang.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, _start, (work, os.getpid())) as pool:
+        try:
+            yield partial(pool.map, _one, chunksize=4)
+        except BrokenProcessPool as error:
+            text = "a process was ended, perhaps because the memory is full: use fewer `processes`"
+            raise naming(ChildProcessError(text), "processes") from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+_work: list[_Work] = []  # of this process of a pool
+
+
+def _start(work: _Work, parent: int) -> None:
+    die_with_parent(parent)
+    warnings.simplefilter("ignore")  # the first process opens the same calibrations
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _work.append(work)
+
+
+def _one(file: str, raw: Any) -> _Warped:
+    return _work[0](file, raw)
+
+
+def _target(
+    to: str, size: tuple[int, int] | None, fov_deg: float | None, up: Sequence[float] | None
+) -> Lens | PixelView:
+    """The new camera, or the view."""
+    if to.partition(":")[0] in list_views():
+        view = named_view("to", to, size or _SIZE, fov_deg=fov_deg, up=up)
+        if not view.uses_lens:
+            raise naming(ValueError(f"`to` {to} shows the picture as it is"), "to")
+        return view
+    for name, value in (("fov_deg", fov_deg), ("up", up)):
+        check(name, value, value is None, "left out unless --to is a view")
+    if not is_json(to) and not os.path.exists(to):
+        text = f"`to` {to} is neither a file nor a view: {', '.join(list_views())}"
+        raise naming(FileNotFoundError(text), "to")
+    calibration = Calibration(to, "--to") if is_json(to) else Calibration.read(to)
+    lens = calibration.lens(image_size=size)
+    if lens.image_size is None:
+        raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
+    return to_corners(lens if size is None else lens.in_picture(size))
+
+
+def _claim(out: str, settings: dict[str, Any]) -> Path:
+    """The folder for the new data set: new, empty, or of the same command before."""
+    folder = Path(out)
+    record = json.loads(json.dumps(settings))
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out must be a folder, but {out} is a file")
+    if folder.is_dir() and any(folder.iterdir()):
+        before = read_json(folder / RECORD) if (folder / RECORD).is_file() else None
+        if before != record:
+            raise ValueError(
+                f"--out {out} holds other files: give a new or an empty folder, or one of an "
+                "earlier run of the same command, which then goes on"
+            )
+        remove_partial_files(folder)
+    replace_file(folder / RECORD, json.dumps(record, indent=1, ensure_ascii=False))
+    return folder
+
+
+def _write(
+    folder: Path, data: LabelledPictures, target: Lens | PixelView, found: Sequence[_Warped],
+    in_yolo: bool, settings: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """Writes the labels, the new camera or view, and the report, and prints it."""
+    entries = data.entries or [{}] * len(data)
+    pictures = [
+        ({**entry, "file_name": file} | ({"source": name} if len(one.pictures) > 1 else {}), labels)
+        for name, entry, one in zip(data.files, entries, found, strict=True)
+        for file, labels in one.pictures
+    ]
+    if in_yolo:
+        write_yolo(folder, pictures, data.categories)
+    else:
+        write_coco(folder / COCO, pictures, data.categories)
+    if isinstance(target, Lens):
+        save(target, folder / LENS)
+    else:
+        lenses = [json.loads(said) for said in dict.fromkeys(one.lens for one in found) if said]
+        view = {name: settings[name] for name in ("fov_deg", "up")}
+        view = {"view": settings["to"], "size": target.size} | view | {"lenses": lenses}
+        replace_file(folder / VIEW, json.dumps(view, indent=1))
+    names = {category["id"]: category["name"] for category in data.categories}
+    left = [
+        {"file": name, "id": thing.more.get("id"), "category": names[thing.category]}
+        for name, one in zip(data.files, found, strict=True)
+        for thing in one.left
+    ]
+    replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
+    bad = [one.error for one in found if one.error]
+    things = sum(len(labels.things) for _, labels in pictures)
+    print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {things} things")
+    if left:
+        print(
+            f"{len(left)} things have left the picture, because less than {LEAST_VISIBLE:.0%} of "
+            f"them is visible; {folder / LEFT} lists them"
+        )
+    if bad:
+        more = [f"and {len(bad) - _NAMED} more"] * (len(bad) > _NAMED)
+        said = "\n".join([*bad[:_NAMED], *more])
+        raise BrokenImageError(f"{len(bad)} of {len(data)} pictures were left out:\n{said}")

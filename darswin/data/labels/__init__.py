@@ -1,0 +1,47 @@
+"""Labels of things: boxes, outlines, masks and keypoints, and the files of data sets."""
+
+from pathlib import Path
+
+from darswin.data.labels.coco import read_coco, write_coco
+from darswin.data.labels.labels import LabelledPictures, Labels, Thing, moved
+from darswin.data.labels.woodscape import BOXES, has_boxes, read_woodscape_boxes
+from darswin.data.labels.yolo import is_yolo, read_yolo, write_yolo
+from darswin.utils.parameters import naming
+from darswin.utils.text import is_json_file
+
+__all__ = [
+    "LabelledPictures",
+    "Labels",
+    "Thing",
+    "moved",
+    "open_labels",
+    "write_coco",
+    "write_yolo",
+]
+
+
+def open_labels(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
+    """The pictures of a data set and their things.
+
+    Args:
+        path: a COCO file, or a folder in the form of YOLO or of WoodScape with its boxes.
+        pictures: the folder of the pictures of a COCO file, if it is not one of the usual places:
+            the folder of the file, `images/` beside it, or where COCO has it.
+
+    Raises:
+        FileNotFoundError: another path, or missing files.
+        ValueError: wrong files, as the functions that read them say.
+    """
+    root = Path(path)
+    if is_json_file(root):
+        return read_coco(root, pictures)
+    if pictures is not None:
+        text = f"`pictures` goes with a COCO file, but {root} is none"
+        raise naming(ValueError(text), "pictures")
+    for recognizes, read in ((has_boxes, read_woodscape_boxes), (is_yolo, read_yolo)):
+        if recognizes(root):
+            return read(root)
+    raise FileNotFoundError(
+        f"no labels in {root}: give a COCO file, instances.json; or a folder with data.yaml, as "
+        f"YOLO has; or with rgb_images/ and {BOXES}/, as WoodScape has"
+    )

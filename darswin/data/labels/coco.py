@@ -1,0 +1,213 @@
+"""COCO's instances and keypoints: a JSON file of boxes, polygons, masks and keypoints.
+
+Pictures are looked for as `file_name` says, in the folder of the file, in `images/` beside it, and
+where COCO has them: in `val2017/` or `images/val2017/` for `annotations/instances_val2017.json`. A
+calibration `lens.json` beside the file, or above `annotations/`, is the lens of all pictures.
+
+Source: cocodataset.org/#format-data.
+"""
+
+import json
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from darswin.boxes import decode_rle
+from darswin.data.cameras import Calibrations
+from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing, box_of_mask
+from darswin.data.scenes.files import calibration_in
+from darswin.data.splits import some
+from darswin.utils.files import replace_file
+from darswin.utils.text import read_json
+
+_OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",
+        "visible"}  # fmt: skip
+_DIGITS = 3  # after the point, in pixels
+
+
+def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
+    """The pictures and things of a COCO file of instances or keypoints.
+
+    Args:
+        pictures: the folder to which `file_name` is relative, if it is in none of the usual places.
+
+    Raises:
+        FileNotFoundError: a missing file or missing pictures.
+        ValueError: another form, unknown pictures or categories, or numbers that are not finite.
+            All errors name the file.
+    """
+    path = Path(path)
+    content = read_json(path)
+    if not isinstance(content, Mapping) or not all(
+        isinstance(content.get(name), list) for name in ("images", "annotations", "categories")
+    ):
+        raise ValueError(f'{path} must have the lists "images", "annotations" and "categories"')
+    try:
+        entries, categories = content["images"], content["categories"]
+        files = [entry["file_name"] for entry in entries]
+        of_picture: dict[Any, list[dict]] = {entry["id"]: [] for entry in entries}
+        mirrors = {
+            category["id"]: _mirror(category.get("keypoints", ())) for category in categories
+        }
+        for annotation in content["annotations"]:
+            if (category := annotation["category_id"]) not in mirrors:
+                raise ValueError(
+                    f"{path}: the annotation {annotation.get('id')} has the category {category!r}, "
+                    f"but the categories are {some(list(mirrors))}"
+                )
+            if (picture := annotation["image_id"]) not in of_picture:
+                raise ValueError(
+                    f"{path}: the annotation {annotation.get('id')} is of the picture {picture!r}, "
+                    "which the file does not list"
+                )
+            of_picture[picture].append(annotation)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not in COCO's form: it lacks {error}") from error
+    if len(of_picture) < len(entries) or len(set(files)) < len(files):
+        raise ValueError(f"{path} lists a picture twice")
+    folder = Path(pictures) if pictures is not None else _folder(path, files)
+    if missing := [file for file in files if not (folder / file).is_file()]:
+        raise FileNotFoundError(
+            f"{len(missing)} of {len(files)} pictures of {path} are not in {folder}: "
+            f"{some(missing)}"
+        )
+    calibration = calibration_in(path.parent, path.parent.parent)
+    return LabelledPictures(
+        folder, files, [(entry, of_picture[entry["id"]]) for entry in entries],
+        partial(_labels, path=str(path), mirrors=mirrors), categories, entries,
+        Calibrations(calibration, folder) if calibration else None,
+    )  # fmt: skip
+
+
+def write_coco(
+    path: str | Path,
+    pictures: Sequence[tuple[Mapping[str, Any], Labels]],
+    categories: Sequence[Mapping[str, Any]],
+) -> None:
+    """Writes a COCO file.
+
+    Box and area are those of the labels, and "visible" is the share that a picture shows. Ids that
+    several pictures or things have, or none, are numbered anew.
+
+    Args:
+        pictures: of each picture, its entry, such as {"file_name": "a.png"}, and its labels.
+        categories: as in `LabelledPictures`.
+    """
+    entries = [
+        {**entry, "height": labels.size[0], "width": labels.size[1]} for entry, labels in pictures
+    ]
+    _number(entries)
+    annotations = []
+    for entry, (_, labels) in zip(entries, pictures, strict=True):
+        for thing in labels.things:
+            annotations.append(_annotation(thing) | {"image_id": entry["id"]})
+    _number(annotations)
+    content = {"images": entries, "annotations": annotations, "categories": list(categories)}
+    replace_file(path, json.dumps(content, allow_nan=False))
+
+
+def _number(entries: Sequence[dict]) -> None:
+    ids = [entry.get("id") for entry in entries]
+    if None in ids or len(set(ids)) < len(ids):
+        for number, entry in enumerate(entries, 1):
+            entry["id"] = number
+
+
+def _annotation(thing: Thing) -> dict[str, Any]:
+    x0, y0, x1, y1 = thing.box
+    found: dict[str, Any] = {
+        **thing.more,
+        "category_id": thing.category,
+        "bbox": _rounded((x0, y0, x1 - x0, y1 - y0)),
+        "area": round(thing.area, _DIGITS),
+        "iscrowd": int(thing.crowd),
+        "visible": round(thing.visible, _DIGITS),
+    }
+    if thing.rle is not None:
+        found["segmentation"] = thing.rle
+    elif len(thing.polygons):
+        found["segmentation"] = [_rounded(polygon.ravel()) for polygon in thing.polygons]
+    if thing.keypoints is not None:
+        found["keypoints"] = _rounded(thing.keypoints.ravel())
+        found["num_keypoints"] = int((thing.keypoints[:, 2] > 0).sum())
+    return found
+
+
+def _rounded(values: Any) -> list[float]:
+    return np.round(np.asarray(values, float), _DIGITS).tolist()
+
+
+def _folder(path: Path, files: Sequence[str]) -> Path:
+    """The folder of the pictures: of the usual places, the first that has the first picture."""
+    name = path.stem.rpartition("_")[2]
+    places = [
+        place
+        for root in (path.parent, path.parent.parent)
+        for place in (root, root / "images", root / name, root / "images" / name)
+    ]
+    return next((place for place in places if files and (place / files[0]).is_file()), places[1])
+
+
+def _labels(
+    raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, mirrors: Mapping
+) -> Labels:
+    entry, annotations = raw
+    if (said := (entry.get("height"), entry.get("width"))) not in (size, (None, None)):
+        raise ValueError(
+            f"{path} says that {entry['file_name']} has {said[1]} × {said[0]} px, but it has "
+            f"{size[1]} × {size[0]}"
+        )
+    return Labels([_thing(one, path, mirrors, size) for one in annotations], size)
+
+
+def _thing(annotation: Mapping[str, Any], path: str, mirrors: Mapping, size: Size) -> Thing:
+    def numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+        try:
+            table = np.asarray(values, float).reshape(-1, group)
+        except (TypeError, ValueError):
+            table = np.full((1, group), math.nan)
+        if len(table) < least or not np.isfinite(table).all():
+            raise ValueError(
+                f"{path}: the annotation {annotation.get('id')} has the {name} "
+                f"{reprlib.repr(values)}, which must be finite numbers, {group} each"
+            )
+        return table
+
+    segments = annotation.get("segmentation") or ()
+    rle = segments if isinstance(segments, Mapping) else None
+    if rle is not None and tuple(rle.get("size", ())) != size:
+        raise ValueError(
+            f"{path}: the annotation {annotation.get('id')} has a mask of {rle.get('size')} px in "
+            f"a picture of {list(size)}"
+        )
+    polygons = [] if rle is not None else [numbers("polygon", one, 2) for one in segments]
+    if "bbox" in annotation:
+        x, y, width, height = numbers("box", annotation["bbox"], 4)[0]
+        box = np.array([x, y, x + width, y + height])
+    elif rle is not None:
+        box = box_of_mask(decode_rle(rle))
+    elif polygons:
+        corners = np.concatenate(polygons)
+        box = np.concatenate((corners.min(0), corners.max(0)))
+    else:
+        raise ValueError(f"{path}: the annotation {annotation.get('id')} has no bbox")
+    keypoints = annotation.get("keypoints")
+    return Thing(
+        annotation["category_id"], box, polygons, rle,
+        None if keypoints is None else numbers("keypoints", keypoints, 3, 0),
+        mirrors[annotation["category_id"]], bool(annotation.get("iscrowd", 0)),
+        annotation.get("visible", 1.0),
+        {name: value for name, value in annotation.items() if name not in _OWN},
+    )  # fmt: skip
+
+
+def _mirror(names: Sequence[str]) -> list[int]:
+    """For each keypoint, the number of the one on the other side; none without sides."""
+    swap = {"left": "right", "right": "left"}
+    other = ["_".join(swap.get(word, word) for word in name.split("_")) for name in names]
+    return [names.index(name) for name in other] if set(other) == set(names) else []

@@ -1,0 +1,243 @@
+"""Any network of pictures in an ONNX file, run by ONNX Runtime; needs NumPy and onnxruntime."""
+
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from darswin.utils.extras import lack
+from darswin.utils.files import check_is_file
+from darswin.utils.parameters import check, naming
+
+__all__ = ["Detections", "OnnxNetwork"]
+
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+_CHANNELS = (1, 3)
+_DETECTIONS = ("boxes", "scores", "labels")
+_KNOWN = (
+    "known are boxes (B, N, 4), scores (B, N) and labels (B, N) by these names; one output "
+    "(B, N, 6) of x0, y0, x1, y1, score and class; maps (B, K, H, W); and numbers (B, K). A "
+    "network that needs a decoder must have it in its graph"
+)
+
+
+class PartsOfPicture(UserWarning):
+    """The warning of boxes that seem to be in parts of the picture, and not in pixels."""
+
+
+class Detections(NamedTuple):
+    """What a detector finds in a picture.
+
+    Shapes: boxes (K, 4), the corners x0, y0, x1, y1 in px, where the picture covers (0, 0) to
+    (W, H); scores (K,); labels (K,), the numbers of the classes.
+    """
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    labels: np.ndarray
+
+
+class OnnxNetwork:
+    """A network in an ONNX file: `network(pictures)` is what it finds in them.
+
+    A call takes one or several pictures as a `darswin.frames.Sampler` makes them: (n, C, H, W)
+    float32, already normalised, or (n, H, W, C) uint8. It returns a list of `Detections` for a
+    detector, and otherwise a dict of the outputs: maps (n, K, H', W') and numbers (n, K).
+
+    The graph has one input: pictures (B, C, H, W) or (B, H, W, C), or one picture without B; maps
+    then have the same order of axes. If the graph does not name its channels, they come first, and
+    are 3. The outputs of a detector are boxes, scores and labels by these names, (B, N, …), or
+    (N, …) for one picture; or one output (B, N, 6) of x0, y0, x1, y1, score and class. Boxes are in
+    pixels of the picture. To see what the outputs are, the network runs once on black pictures.
+
+    Args:
+        path: the ONNX file.
+        size: (H, W) of the pictures. None means that of the graph, which must then have one.
+        count: the usual number of pictures in a call. They are one batch if the network takes it.
+        threshold: the lowest score of a detection. Others are left out.
+
+    Raises:
+        ModuleNotFoundError: onnxruntime is not installed.
+        ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
+            no known form, or the size is missing or not that of the graph.
+        FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
+
+    Attributes:
+        size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
+        output: the output of a `darswin.frames.Plan` that the network takes, "uint8" or "image".
+        kind: "detections", "maps", or "numbers".
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        size: tuple[int, int] | None = None,
+        count: int = 1,
+        threshold: float = 0.3,
+    ):
+        if (without := lack("onnx", ("onnxruntime",))) is not None:
+            raise ModuleNotFoundError(without)
+        self.path, self.threshold = os.fspath(path), threshold
+        self._session = _session(self.path)
+        own, batch = self._read_input()
+        if size is None and None in own:
+            text = f"missing `size`: {self.path} takes pictures of any size, so choose one"
+            raise naming(ValueError(text), "size")
+        if size is not None:
+            fits = all(side in (None, of) for side, of in zip(own, size, strict=True))
+            wanted = ",".join("any" if side is None else str(side) for side in own)
+            check("size", ",".join(map(str, size)), fits, f"{wanted} for {self.path}")
+        self.size: tuple[int, int] = size or own
+        black = np.zeros((count, self.channels, *self.size), np.float32)
+        self.batch = batch or (count if count > 1 and self._takes(black) else 1)
+        found = self(black)
+        self.kind: Literal["detections", "maps", "numbers"] = "detections"
+        if isinstance(found, dict):
+            self.kind = "maps" if any(v.ndim == 4 for v in found.values()) else "numbers"
+
+    def _read_input(self) -> tuple[tuple[Any, Any], int | None]:
+        """Reads the axes of the input in the graph. Returns its (H, W) and its batch, None for
+        those that are free."""
+        first, *others = self._session.get_inputs()
+        axes = [side if isinstance(side, int) and side > 0 else None for side in first.shape]
+        if others or first.type not in _TYPES or len(axes) not in (3, 4):
+            given = [f"{put.name} {_text(put.shape)} of {put.type}" for put in (first, *others)]
+            raise ValueError(
+                f"{self.path} has the inputs {', '.join(given)}; it must have one, pictures "
+                "(B, C, H, W) or (B, H, W, C) of float or uint8"
+            )
+        self._input, self._type, self._is_single = first.name, _TYPES[first.type], len(axes) == 3
+        batch, *rest = [1] * self._is_single + axes
+        self._is_last = rest[2] in _CHANNELS and rest[0] not in _CHANNELS
+        channels = rest.pop(2 if self._is_last else 0)
+        if channels not in (None, *_CHANNELS):
+            raise ValueError(
+                f"{self.path} takes pictures {_text(first.shape)}, but they must have 1 or 3 "
+                "channels"
+            )
+        self.channels = channels or 3
+        self.output: Literal["uint8", "image"] = "uint8" if self._type is np.uint8 else "image"
+        return (rest[0], rest[1]), batch
+
+    def _takes(self, pictures: np.ndarray) -> bool:
+        """False if the graph makes its batch 1 inside, though that of its input is free."""
+        try:
+            self._run(pictures)
+        except ValueError:
+            return False
+        return True
+
+    def __call__(self, pictures: np.ndarray) -> list[Detections] | dict[str, np.ndarray]:
+        if pictures.dtype == np.uint8:
+            pictures = np.moveaxis(pictures.reshape(-1, *self.size, self.channels), -1, 1)
+        pictures = pictures.reshape(-1, self.channels, *self.size)
+        found: list[Any] = []
+        for start in range(0, len(pictures), self.batch):
+            part = pictures[start : start + self.batch]
+            spare = np.zeros((self.batch - len(part), *part.shape[1:]), part.dtype)
+            found += self._run(np.concatenate((part, spare)))
+        found = found[: len(pictures)]
+        if isinstance(found[0], Detections):
+            return found
+        return {name: np.stack([each[name] for each in found]) for name in found[0]}
+
+    def _run(self, pictures: np.ndarray) -> list[Any]:
+        """What one batch (B, C, H, W) shows, for each picture: `Detections`, or its outputs."""
+        if self._is_last:
+            pictures = np.moveaxis(pictures, 1, -1)
+        batch = np.ascontiguousarray(pictures[0] if self._is_single else pictures, self._type)
+        try:
+            values = self._session.run(None, {self._input: batch})
+        except Exception as error:  # onnxruntime has a class of its own for each kind of failure
+            raise ValueError(f"onnxruntime cannot run {self.path}: {_line(error)}") from error
+        outputs = {
+            put.name: np.asarray(value)[None] if self._is_single else np.asarray(value)
+            for put, value in zip(self._session.get_outputs(), values, strict=True)
+        }
+        found: list[Any] | None = []
+        if all(value.dtype.kind in "biuf" for value in outputs.values()):
+            found = self._detections(outputs, len(pictures))
+            found = self._others(outputs, len(pictures)) if found is None else found
+        if not found:
+            given = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
+            raise ValueError(f"{self.path} has the outputs {', '.join(given)}; {_KNOWN}")
+        return found
+
+    def _detections(self, outputs: dict[str, np.ndarray], count: int) -> list[Any] | None:
+        """The detections in each of `count` pictures, [] if they have wrong shapes; None if the
+        network is no detector."""
+        named = {name.lower(): value for name, value in outputs.items()}
+        if named.keys() >= set(_DETECTIONS):
+            boxes, scores, labels = (named[name] for name in _DETECTIONS)
+            boxes = boxes[None] if boxes.ndim == 2 else boxes
+        else:
+            (table, *others) = outputs.values()
+            if others or table.ndim != 3 or table.shape[2] != 6:
+                return None
+            boxes, scores, labels = table[..., :4], table[..., 4], table[..., 5]
+        shape = boxes.shape[:2]
+        if boxes.shape != (count, *shape[1:], 4):
+            return []
+        if not scores.size == labels.size == boxes.size // 4:
+            return []
+        each = zip(boxes, scores.reshape(shape), labels.reshape(shape), strict=True)
+        return [self._kept(*one) for one in each]
+
+    def _kept(self, *found: np.ndarray) -> Detections:
+        """The detections of one picture whose score is high enough."""
+        keep = ~(found[1] < self.threshold)
+        boxes, scores, labels = (values[keep].astype(np.float64) for values in found)
+        self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
+        if (labels % 1).any():
+            raise ValueError(f"{self.path} finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
+        if len(boxes) and boxes.max() <= 1:
+            text = (
+                f"the boxes of {self.path} are all within 1 px: if they are in parts of the "
+                "picture, its graph must multiply them by its width and height"
+            )
+            warnings.warn(text, PartsOfPicture, stacklevel=2)
+        return Detections(boxes, scores, labels.astype(np.int64))
+
+    def _others(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
+        """Maps (K, H', W') and numbers (K,) of each picture; [] if there are other outputs."""
+        found = {}
+        for name, values in outputs.items():
+            if values.ndim == 3 and values.shape[1:] == self.size:
+                values = values[:, None]
+            elif values.ndim == 4 and self._is_last:
+                values = np.moveaxis(values, -1, 1)
+            if values.ndim not in (1, 2, 4) or len(values) != count:
+                return []
+            self._check_numbers(values)
+            found[name] = values
+        return [{name: values[k] for name, values in found.items()} for k in range(count)]
+
+    def _check_numbers(self, *outputs: np.ndarray) -> None:
+        if not all(np.isfinite(values).all() for values in outputs):
+            raise FloatingPointError(f"{self.path} computes NaN or infinity")
+
+
+def _session(path: str) -> Any:
+    """The graph of an ONNX file, ready to run."""
+    import onnxruntime
+
+    check_is_file(path)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"there is no file {path}")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # errors are raised, and need not be printed as well
+    try:
+        return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ValueError(f"onnxruntime cannot read {path}: {_line(error)}") from error
+
+
+def _text(shape: Sequence[int | str | None]) -> str:
+    return "(" + ", ".join("?" if side is None else str(side) for side in shape) + ")"
+
+
+def _line(error: Exception) -> str:
+    """An error of onnxruntime in one line."""
+    return " ".join(str(error).split())[:300]

@@ -1,0 +1,491 @@
+"""`darswin predict --network`: what a network of a known answer finds, at its exact place."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+from graphs import write_graph
+
+from darswin.cli.main import main
+from darswin.utils.video import write_frames
+
+SIZE = (240, 320)
+CENTER = [163.0, 117.0]
+NAMES = ["red", "green", "blue"]
+RADIUS = 7.0  # degrees, of the discs that are to be found
+
+
+def fisheye(points, focal, radial, **_):
+    camera = np.array([[focal, 0, CENTER[0]], [0, focal, CENTER[1]], [0, 0, 1.0]])
+    there, _ = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), camera,
+                                         np.array(radial))  # fmt: skip
+    return there[0]
+
+
+def pinhole(points, focal, radial, tangential, **_):
+    camera = np.array([[focal, 0, CENTER[0]], [0, focal, CENTER[1]], [0, 0, 1.0]])
+    there, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera,
+                                 np.array([*radial[:2], *tangential, radial[2]]))  # fmt: skip
+    return there[:, 0]
+
+
+def equidistant(points, focal, **_):
+    aside = np.linalg.norm(points[:, :2], axis=1)
+    radius = focal * np.arctan2(aside, points[:, 2])
+    return points[:, :2] * (radius / aside)[:, None] + CENTER
+
+
+def mei(points, focal, xi, **_):
+    return focal * points[:, :2] / (points[:, 2:] + xi) + CENTER
+
+
+# Each lens, what computes its pixels without darswin, and where the discs are: degrees to the
+# right and up.
+ASIDE = [(0, 0), (40, 15), (-55, -10), (5, 38), (75, 0), (-50, 30)]
+NEAR = [(0, 0), (25, 8), (-22, -12), (3, 14)]
+LENSES = {
+    "KannalaBrandt": (
+        {"focal": 95.0, "radial": [0.02, -0.01, 0.003, -0.0005], "theta_max": 1.5}, fisheye, ASIDE),
+    "BrownConrady": (
+        {"focal": 240.0, "radial": [-0.12, 0.03, 0.0], "tangential": [0.002, -0.003],
+         "theta_max": 0.7}, pinhole, NEAR),
+    "Equidistant": ({"focal": 88.0, "theta_max": math.radians(95)}, equidistant, ASIDE),
+    "Mei": ({"focal": 215.0, "xi": 1.3, "theta_max": 1.6}, mei, ASIDE),
+}  # fmt: skip
+# Each view, its size, and by how many pixels of the picture a box may be wrong: less than one and
+# a half pixels of the view, and more where a view does not show discs as upright ellipses.
+VIEWS = {
+    "none": (None, 1.1),
+    "tiles:9": ((256, 256), 2.0),
+    "tiles:5": ((256, 256), 1.8),
+    "mercator": ((256, 384), 1.5),
+    "stereographic": ((320, 320), 1.5),
+    "panorama": ((320, 512), 2.2),
+    "perspective": ((512, 512), 2.0),
+}
+
+
+def direction_of(azimuth, elevation):
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    level = math.cos(elevation)
+    return np.array([level * math.sin(azimuth), -math.sin(elevation), level * math.cos(azimuth)])
+
+
+def rim_of(direction):
+    """The unit vectors of the rim of a disc."""
+    aside = np.cross(direction, (0, 1, 0))
+    aside /= np.linalg.norm(aside)
+    other, turn = np.cross(direction, aside), np.linspace(0, 2 * np.pi, 720)[:, None]
+    angle = math.radians(RADIUS)
+    around = np.cos(turn) * aside + np.sin(turn) * other
+    return math.cos(angle) * direction + math.sin(angle) * around
+
+
+def paint(points, channel, size=SIZE):
+    """A picture with a disc whose rim is at these pixels, and its box."""
+    picture = np.zeros((*size, 3), np.uint8)
+    color = [0, 0, 0]
+    color[channel] = 255
+    picture[..., channel] = 20
+    cv2.fillPoly(picture, [np.rint(16 * points).astype(np.int32)], color, shift=4)
+    return picture, np.concatenate((points.min(0), points.max(0))) + 0.5
+
+
+def lens_of(name, size=SIZE):
+    return {"model": name, "center": CENTER, "image_size": list(size)} | LENSES[name][0]
+
+
+def predict(*argv, out, lens):
+    main(["predict", *map(str, argv), "--lens", json.dumps(lens), "--out", str(out)])
+    return json.loads((Path(out) / "predictions.json").read_text())
+
+
+def write_picture(path, picture):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), picture[..., ::-1])
+    return path
+
+
+def picture_of(name, place, channel):
+    """A picture through a lens, and the box of its disc."""
+    options, project, _ = LENSES[name]
+    return paint(project(rim_of(direction_of(*place)), **options), channel)
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_disc_is_found_at_its_place(tmp_path, view, name):
+    size, tolerance = VIEWS[view]
+    places = [p for p in LENSES[name][2] if view != "perspective" or max(map(abs, p)) < 50]
+    known = []
+    for k, place in enumerate(places):
+        picture, box = picture_of(name, place, k % 3)
+        write_picture(tmp_path / "in" / f"{k}.png", picture)
+        known.append((place, box, NAMES[k % 3]))
+    (tmp_path / "names.txt").write_text("\n".join(NAMES))
+    network = write_graph(tmp_path / "n.onnx", size=size or SIZE)
+    argv = [tmp_path / "in", "--network", network, "--view", view, "--threshold", "0.5"]
+    argv += ["--labels", tmp_path / "names.txt"]  # parts of discs have lower scores
+    argv += ["--fov_deg", "130"] if view == "perspective" else []
+    found = predict(*argv, out=tmp_path / "out", lens=lens_of(name))
+    for k, (entry, (place, box, label)) in enumerate(zip(found, known, strict=True)):
+        assert entry["image"] == str(tmp_path / f"in/{k}.png")
+        assert entry["overlay"] == f"overlays/{k}.jpg"
+        (one,) = entry["detections"]  # of all tiles
+        assert one["label"] == label and 0.5 < one["score"] < 1 and one["visible"] == 1
+        np.testing.assert_allclose(one["box"], box, atol=tolerance)
+        # The direction that was painted; a pixel of the picture is less than 0.7 degrees.
+        assert (one["azimuth_deg"], one["elevation_deg"]) == pytest.approx(place, abs=0.7)
+        assert (one["width_deg"], one["height_deg"]) == pytest.approx([2 * RADIUS] * 2, abs=2.5)
+        np.testing.assert_allclose(one["ray"], direction_of(*place), atol=0.015)
+
+
+FORMS = {
+    "table": dict(outputs="table"),
+    "uint8": dict(dtype="uint8"),
+    "channels last": dict(channels_last=True),
+    "uint8, channels last": dict(dtype="uint8", channels_last=True),
+    "half": dict(dtype="float16"),
+    "batch 1": dict(batch=1),
+    "batch 2": dict(batch=2, outputs="table"),
+    "of one picture": dict(outputs="of one picture", batch=None),
+    "free": dict(size=("H", "W")),
+}
+
+
+@pytest.fixture(scope="module")
+def disc(tmp_path_factory):
+    """A green disc where two tiles overlap, and what is found in it."""
+    folder = tmp_path_factory.mktemp("disc")
+    picture, box = picture_of("Equidistant", (36, -8), 1)
+    write_picture(folder / "p.png", picture)
+    (found,) = run_tiles(folder, write_graph(folder / "n.onnx", size=(256, 256)))
+    return folder, box, found
+
+
+def run_tiles(folder, network, *argv, picture="p.png"):
+    argv = [folder / picture, "--network", network, "--view", "tiles:5", *argv]
+    return predict(*argv, out=folder / "out", lens=lens_of("Equidistant"))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_a_network_gives_the_same(tmp_path, disc, form):
+    folder, box, expected = disc
+    network = write_graph(tmp_path / "n.onnx", **({"size": (256, 256)} | FORMS[form]))
+    (found,) = run_tiles(folder, network, *(["--size", "256,256"] if form == "free" else []))
+    (one,), (other,) = found["detections"], expected["detections"]
+    assert one["label"] == other["label"] == 1
+    np.testing.assert_allclose(one["box"], other["box"], atol=0.7)  # uint8 is rounded before
+    np.testing.assert_allclose(one["box"], box, atol=1.8)
+
+
+def test_the_box_is_drawn_on_the_picture(disc):
+    folder, _, found = disc
+    drawn = cv2.imread(str(folder / "out" / found["overlay"]))[..., ::-1].astype(int)
+    plain = cv2.imread(str(folder / "p.png"))[..., ::-1].astype(int)
+    changed = np.abs(drawn - plain).max(-1) > 60
+    (one,) = found["detections"]
+    left, _, right, bottom = np.rint(one["box"]).astype(int)
+    assert changed[bottom - 1, left:right].mean() > 0.9  # a line along the last row of the box
+    assert not changed[bottom + 3 :].any() and not changed[:, : left - 3].any()
+
+
+def test_colours_and_their_normalization_are_the_networks(disc, tmp_path):
+    """BGR makes red of blue; and only a picture that is normalised is above 0.5."""
+    folder, box, _ = disc
+    write_picture(folder / "blue.png", picture_of("Equidistant", (36, -8), 2)[0])
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    for argv, label in (([], 2), (["--channels", "rgb"], 2), (["--channels", "bgr"], 0)):
+        (found,) = run_tiles(folder, network, *argv, picture="blue.png")
+        assert [one["label"] for one in found["detections"]] == [label]
+    for argv, count in (
+        (["--mean", "0.6"], 0),  # 1 becomes 0.4
+        (["--mean", "0.6", "--std", "0.5"], 1),  # 0.8
+        (["--mean", "0.2,0.3,0.6", "--std", "1,1,1"], 0),
+        (["--mean", "0.6,0.3,0.2", "--std", "1,1,1"], 1),
+        (["--mean", "0.6,0.3,0.2", "--channels", "bgr"], 0),
+        (["--std", "3"], 0),
+    ):
+        (found,) = run_tiles(folder, network, *argv, picture="blue.png")
+        assert len(found["detections"]) == count, argv
+        if count:
+            np.testing.assert_allclose(found["detections"][0]["box"], box, atol=1.8)
+
+
+def test_gravity_and_a_field_of_view_change_what_is_seen(disc, tmp_path):
+    """Tiles that are level with another up, and a view too narrow for the disc."""
+    folder, box, _ = disc
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    for argv, count in (
+        (["--up", "0.6,-0.8,0"], 1), (["--up", "0 -1 2"], 1),
+        (["--view", "mercator", "--fov_deg", "50"], 0),
+        (["--view", "mercator", "--fov_deg", "120"], 1),
+        (["--view", "mercator", "--fov_deg", "120", "--up", "1,0,0"], 1),
+        (["--view", "square"], 1),
+    ):  # fmt: skip
+        (found,) = run_tiles(folder, network, *argv)
+        assert len(found["detections"]) == count, argv
+        for one in found["detections"]:
+            np.testing.assert_allclose(one["box"], box, atol=3)
+    (mercator,), (default,) = (
+        predict(folder / "p.png", "--network", network, *argv, out=folder / "out",
+                lens=lens_of("Equidistant"))
+        for argv in ([], ["--view", "mercator"])
+    )  # fmt: skip
+    assert mercator == default
+
+
+def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(tmp_path):
+    """A box that a network draws around what it guesses beyond θ_max, and one that is all there."""
+    onnx = pytest.importorskip("onnx")
+    lens = lens_of("Equidistant") | {"theta_max": 1.0}  # 88 px around (163, 117)
+    table = {
+        "inside": [100, 60, 130, 90], "cut": [2, 40, 72, 90], "beyond": [0, 0, 20, 20],
+        "outside": [400, 0, 420, 20], "no width": [150, 100, 150, 120], "turned": [9, 9, 5, 5],
+        "half outside": [150, 100, np.inf, 120],
+    }  # fmt: skip
+    rows = np.array([[*box, 0.9 - k / 100, k] for k, box in enumerate(table.values())])
+    rows = np.concatenate((rows, [[105, 65, 125, 85, 0.5, 0]]))  # in the first, of its class
+    values = onnx.helper.make_tensor("t", onnx.TensorProto.FLOAT, (1, *rows.shape), rows.ravel())
+    node = onnx.helper.make_node("Constant", [], ["found"], value=values)
+    model = onnx.parser.parse_model("""<ir_version: 8, opset_import: ["" : 18]>
+        network (float[1,3,240,320] images) => (float[1,N,6] found) { found = Neg(images) }""")
+    model.graph.node[0].CopyFrom(node)
+    onnx.save(model, tmp_path / "n.onnx")
+    (tmp_path / "names.json").write_text(json.dumps([*table]))
+    write_picture(tmp_path / "p.png", np.zeros((*SIZE, 3), np.uint8))
+    argv = [
+        tmp_path / "p.png",
+        "--network",
+        tmp_path / "n.onnx",
+        "--labels",
+        tmp_path / "names.json",
+    ]
+    (entry,) = predict(*argv, "--view", "stereographic", out=tmp_path / "out", lens=lens)
+    labels = [one["label"] for one in entry["detections"]]
+    assert labels == ["inside", "cut", "half outside", "inside"]  # the best first
+    kept = dict(zip(labels[:3], entry["detections"], strict=False))
+    assert kept["inside"]["visible"] == 1 and 0.1 < kept["cut"]["visible"] < 0.9
+    for one in kept.values():
+        x0, y0, x1, y1 = one["box"]
+        corner = [max(abs(x0 - CENTER[0]), abs(x1 - CENTER[0])), 0]
+        assert x0 < x1 and y0 < y1 and np.linalg.norm(corner) < 89.5
+
+
+def test_each_frame_of_a_video(tmp_path, capsys):
+    places = [(-40 + 20 * k, 5) for k in range(5)]
+    pictures, known = zip(*(picture_of("Equidistant", place, 1) for place in places), strict=True)
+    write_frames(tmp_path / "v.mp4", pictures, 10)
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    *found, speed = run_tiles(tmp_path, network, "--every", "2", picture="v.mp4")
+    assert [entry["frame"] for entry in found] == [0, 2, 4]
+    for entry, box in zip(found, known[::2], strict=True):
+        assert entry["overlay"] == f"overlays/v.mp4/{entry['frame']:06}.jpg"
+        assert (tmp_path / "out" / entry["overlay"]).is_file()
+        (one,) = entry["detections"]
+        np.testing.assert_allclose(one["box"], box, atol=2.5)  # of compressed frames
+    assert speed["frames"] == 3
+    assert 0 < speed["frames_per_second"] < speed["network_frames_per_second"]
+    assert "v.mp4: 3 frames at" in capsys.readouterr().err
+
+
+def test_bad_files_are_named_and_all_others_are_written(disc, tmp_path):
+    folder, _, expected = disc
+    for name in ("b.png", "d.png"):
+        (tmp_path / name).write_bytes((folder / "p.png").read_bytes())
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (tmp_path / "c.mp4").write_text("no video")
+    write_picture(tmp_path / "e.png", np.zeros((100, 100, 3), np.uint8))
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    said = r"no complete prediction for 3 of 5 files:\n.*a\.png.*\n.*c\.mp4.*\n.*100×100"
+    for _ in range(2):  # again into the folder that it left
+        with pytest.raises(SystemExit, match=said):
+            run_tiles(tmp_path, network, picture=".")
+        found = json.loads((tmp_path / "out" / "predictions.json").read_text())
+        assert [entry["image"] for entry in found] == [f"{tmp_path}/b.png", f"{tmp_path}/d.png"]
+        assert all(entry["detections"] == expected["detections"] for entry in found)
+
+
+@pytest.mark.parametrize("view", ["tiles:5", "mercator", "square", "perspective"])
+def test_a_view_that_sees_nothing_is_told_for_each_camera(disc, tmp_path, view):
+    """The image circle of one of two cameras is beside of its pictures."""
+    folder, _, _ = disc
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.png").write_bytes((folder / "p.png").read_bytes())
+    lenses = {f"{name}.png": lens_of("Equidistant") for name in "ab"}
+    lenses["a.png"] |= {"center": [500.0, 100.0]}
+    (tmp_path / "lenses.json").write_text(json.dumps(lenses))
+    network = write_graph(tmp_path / "n.onnx", size=(64, 64))
+    argv = ["predict", *(tmp_path / f"{name}.png" for name in "ab"), "--network", network]
+    argv += ["--view", view, "--lens", tmp_path / "lenses.json", "--out", tmp_path / "out"]
+    with pytest.raises(SystemExit, match=r"for 1 of 2 pictures:\n.*a\.png has no such view: "):
+        main([str(word) for word in argv])
+    (found,) = json.loads((tmp_path / "out" / "predictions.json").read_text())
+    assert found["image"] == str(tmp_path / "b.png")
+
+
+def test_a_network_that_takes_other_pictures(disc, tmp_path):
+    """The pictures as they are must have the size that it takes, and the way that one is given."""
+    folder, _, _ = disc
+    network, lens = write_graph(tmp_path / "n.onnx", size=(64, 64)), lens_of("Equidistant")
+    argv = [folder / "p.png", "--network", network, "--view", "none"]
+    with pytest.raises(SystemExit, match=r"p\.png .* is 320×240, but the network takes 64×64: cho"):
+        predict(*argv, out=tmp_path / "out", lens=lens)
+    assert (tmp_path / "out" / "predictions.json").read_text() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ("--network n.onnx --view fish", r"view must be one of .*'mercator'.* got 'fish'"),
+        ("--network n.onnx --view polar", "--view polar shows no picture to a network"),
+        ("--network n.onnx --view mercator:3", "'mercator' has no such option: .*'count'"),
+        ("--network n.onnx --view tiles:x", r"--view must be NAME or NAME:COUNT, .* got tiles:x"),
+        ("--network n.onnx --view tiles:3", "count must be from 4 to 9, got 3"),
+        ("--network n.onnx --view square --fov_deg 90", "'square' has no such option: .*'fov'"),
+        ("--network n.onnx --view none --up 0,0,1", "'none' has no such option: .*'up'"),
+        ("--network n.onnx --fov_deg 0", "--fov_deg must be above 0° and at most 360°, got 0"),
+        ("--network n.onnx --fov_deg 400", "--fov_deg must be above 0°"),
+        ("--network n.onnx --up 0,0,0", "up must be three finite numbers"),
+        ("--network n.onnx --mean 1,2", "mean.*per channel"),
+        ("--network n.onnx --std 0", "std"),
+        ("--network n.onnx --std nan", "--std must be finite, got nan"),
+        ("--network n.onnx --mean inf", "--mean must be finite, got inf"),
+        ("--network n.onnx --size 64,64", "--size must be 256,256 for n.onnx, got 64,64"),
+        ("--network free.onnx", "missing --size: free.onnx takes pictures of any size"),
+        (
+            "--network bytes.onnx --std 2",
+            "bytes.onnx takes pixels of uint8: leave --mean and --std",
+        ),
+        ("--network n.onnx --threshold nan", "--threshold must be finite, got nan"),
+        ("--network gone.onnx", "there is no file gone.onnx"),
+        ("--network p.png", r"onnxruntime cannot read p\.png"),
+        ("--network raw.onnx", r"raw.onnx has the outputs output0 \(1, 4, 7\); known are"),
+        ("--network nan.onnx", "nan.onnx computes NaN"),
+        ("--network n.onnx --labels gone.txt", "gone.txt"),
+        ("--network n.onnx --task distance", "--task is distance, but n.onnx is a model for detec"),
+        ("--network n.onnx --model digits", "give either --run, .* or --network, an ONNX file"),
+        ("--network n.onnx --run r", "give either --run, .* or --network, an ONNX file"),
+        ("--model digits --view mercator", "--view is an option of --network, an ONNX file"),
+        ("--model digits --labels l.txt", "--labels is an option of --network"),
+    ],
+)
+def test_what_is_wrong_is_named(disc, tmp_path, monkeypatch, argv, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.png").write_bytes((disc[0] / "p.png").read_bytes())
+    for name, options in (
+        ("n", {}), ("free", {"size": ("H", "W")}), ("bytes", {"dtype": "uint8"}),
+        ("raw", {"outputs": "undecoded"}), ("nan", {"outputs": "nan"}),
+    ):  # fmt: skip
+        write_graph(tmp_path / f"{name}.onnx", **({"size": (256, 256)} | options))
+    words = ["p.png", *argv.split(), "--lens", json.dumps(lens_of("Equidistant")), "--out", "out"]
+    with pytest.raises(SystemExit, match=said):
+        main(["predict", *words])
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ("--up 0,1", "--up must be 3 numbers, such as 0.5,0.5,0.5, got [0,1]"),
+        ("--mean a", "--mean must be numbers, such as 0.5,1, got a"),
+        ("--channels grb", "--channels must be one of rgb, bgr, got grb"),
+        ("--fov_deg wide", "--fov_deg must be a number, got wide"),
+    ],
+)
+def test_what_cannot_be_read_is_named(capsys, argv, said):
+    with pytest.raises(SystemExit):
+        main(["predict", "--network", "n.onnx", *argv.split()])
+    assert said in capsys.readouterr().err
+
+
+def test_without_what_a_network_needs(disc, tmp_path, monkeypatch):
+    network = str(write_graph(tmp_path / "n.onnx", size=(64, 64)))
+    picture, lens = str(disc[0] / "p.png"), json.dumps(lens_of("Equidistant"))
+    for argv, said in (
+        ([picture], "missing --lens"), (["--lens", lens], "missing pictures or videos"),
+        ([picture, "--lens", lens], "missing --out"),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit, match=said):
+            main(["predict", "--network", network, *argv])
+    monkeypatch.setattr(
+        "darswin.deploy.network.lack", lambda extra, modules: f"{modules[0]} missing"
+    )
+    with pytest.raises(SystemExit, match="onnxruntime missing"):
+        main(["predict", picture, "--network", network, "--lens", lens])
+
+
+def test_what_was_found_before_an_error_is_kept(disc, tmp_path):
+    """Of a network that computes NaN where there is light, and of a class without a name."""
+    folder, _, _ = disc
+    write_picture(tmp_path / "in/a.png", np.zeros((*SIZE, 3), np.uint8))
+    (tmp_path / "in/b.png").write_bytes((folder / "p.png").read_bytes())
+    (tmp_path / "names.txt").write_text("red\n")
+    size = (256, 256)
+    nan = write_graph(tmp_path / "nan.onnx", "nan boxes", size=size)
+    net = write_graph(tmp_path / "n.onnx", size=size)
+    for network, argv, said in (
+        (nan, [], r"no prediction for .*b\.png: .*nan\.onnx computes NaN"),
+        (net, ["--labels", tmp_path / "names.txt"], "found class 1, but --labels has 1 names"),
+    ):
+        with pytest.raises(SystemExit, match=said):
+            run_tiles(tmp_path, network, *argv, picture="in")
+        (found,) = json.loads((tmp_path / "out" / "predictions.json").read_text())
+        assert found["image"] == str(tmp_path / "in/a.png") and found["detections"] == []
+
+
+# -- maps and numbers -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", ["none", "tiles:5", "mercator", "square", "perspective"])
+def test_maps_come_back_to_the_pixels(tmp_path, view):
+    """A map of the view's own pixels is the picture again, where the view shows it."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    smooth = [128 + 100 * np.sin(x / 40), 128 + 100 * np.cos(y / 30), 60 + 0 * x]
+    picture = np.stack(smooth, -1).astype(np.uint8)
+    write_picture(tmp_path / "p.png", picture)
+    size = SIZE if view == "none" else (320, 320)
+    network = write_graph(tmp_path / "n.onnx", "map and numbers", size=size)
+    argv = [tmp_path / "p.png", "--network", network, "--view", view]
+    argv += ["--fov_deg", "120"] if view == "perspective" else []
+    (entry,) = predict(*argv, out=tmp_path / "out", lens=lens_of("Equidistant"))
+    files = entry["same"]
+    assert files == {"map": "maps/same/p.npy", "labels": "labels/same/p.png",
+                     "overlay": "overlays/same/p.jpg"}  # fmt: skip
+    same = np.load(tmp_path / "out" / files["map"])
+    assert same.shape == (3, *SIZE) and same.dtype == np.float32
+    labels = np.asarray(Image.open(tmp_path / "out" / files["labels"]))
+    assert labels.shape == SIZE and set(np.unique(labels)) <= {0, 1, 2, 255}
+    shown = labels != 255
+    beyond = np.hypot(x - CENTER[0], y - CENTER[1]) > 88 * math.radians(95) + 2  # θ_max
+    if view == "none":
+        assert shown.all()
+    else:
+        assert shown.mean() > 0.3 and not shown[beyond].any() and not same[:, beyond].any()
+    inner = cv2.erode(shown.astype(np.uint8), np.ones((15, 15))) > 0
+    difference = np.abs(same.transpose(1, 2, 0) - picture / 255)[inner]
+    assert np.quantile(difference, 0.99) < 0.01  # the borders of the picture mix with black
+    clear = inner & (np.abs(picture[..., 0].astype(int) - picture[..., 1]) > 15)
+    assert (labels == picture.argmax(-1))[clear].mean() > 0.99
+    numbers = np.array(entry["light_"])  # of the view, or of each tile
+    assert numbers.shape == ((5, 3) if view == "tiles:5" else (3,))
+
+
+def test_numbers_are_printed_or_written_to_a_file(disc, tmp_path, capsys):
+    folder, _, _ = disc
+    network = write_graph(tmp_path / "n.onnx", "numbers", size=(64, 64))
+    argv = ["predict", str(folder / "p.png"), "--network", str(network), "--view", "tiles:4"]
+    argv += ["--lens", json.dumps(lens_of("Equidistant"))]
+    main(argv)
+    (entry,) = json.loads(capsys.readouterr().out)
+    assert np.array(entry["logits"]).shape == (4, 3) and entry["image"] == str(folder / "p.png")
+    main([*argv, "--out", str(tmp_path / "o.json")])
+    assert json.loads((tmp_path / "o.json").read_text()) == [entry]

@@ -1,0 +1,308 @@
+"""COCO, YOLO and WoodScape: files read, written and read again, and wrong files."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scenes import write_woodscape
+
+from darswin.boxes import encode_rle
+from darswin.data.labels import (
+    Labels,
+    Thing,
+    open_labels,
+    read_coco,
+    read_woodscape_boxes,
+    read_yolo,
+    write_coco,
+    write_yolo,
+)
+
+SIZE = (60, 80)
+MASK = np.zeros(SIZE, np.uint8)
+MASK[10:20, 30:50] = 1
+PERSON = {
+    "id": 1, "name": "person", "supercategory": "animal",
+    "keypoints": ["nose", "left_eye", "right_eye"], "skeleton": [[1, 2]],
+}  # fmt: skip
+CATEGORIES = [PERSON, {"id": 18, "name": "dog"}]
+ANNOTATIONS = [
+    {"id": 5, "image_id": 9, "category_id": 18, "bbox": [10, 20, 30, 15], "area": 450,
+     "iscrowd": 0, "attributes": {"tame": True}},
+    {"id": 6, "image_id": 9, "category_id": 1, "bbox": [1, 2, 20, 10], "area": 100, "iscrowd": 0,
+     "segmentation": [[1, 2, 21, 2, 21, 12], [1, 5.5, 3, 5.5, 3, 8, 1, 8]],
+     "keypoints": [5, 5, 2, 6, 4, 1, 0, 0, 0], "num_keypoints": 2},
+    {"id": 7, "image_id": 9, "category_id": 1, "bbox": [30, 10, 20, 10], "area": 200, "iscrowd": 1,
+     "segmentation": encode_rle(MASK, compressed=False)},
+    {"id": 8, "image_id": 4, "category_id": 1, "bbox": [30, 10, 20, 10], "area": 200, "iscrowd": 0,
+     "segmentation": encode_rle(MASK)},
+]  # fmt: skip
+IMAGES = [
+    {"id": 9, "file_name": "a.png", "height": 60, "width": 80, "license": 3},
+    {"id": 4, "file_name": "sub/b.png", "height": 60, "width": 80},
+    {"id": 2, "file_name": "c.png", "height": 60, "width": 80},
+]
+
+
+def write(folder, place="images", path="instances.json", **changes):
+    for entry in IMAGES:
+        file = folder / place / entry["file_name"]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), np.zeros((*SIZE, 3), np.uint8))
+    content = {"images": IMAGES, "annotations": ANNOTATIONS, "categories": CATEGORIES} | changes
+    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    (folder / path).write_text(json.dumps(content))
+    return folder / path
+
+
+def changed(number, **changes):
+    annotations = [dict(annotation) for annotation in ANNOTATIONS]
+    annotations[number] |= changes
+    return {"annotations": annotations}
+
+
+# -- COCO -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("place", "path"),
+    [
+        ("images", "instances.json"),
+        (".", "labels.json"),
+        ("val2017", "annotations/instances_val2017.json"),
+        ("images/val2017", "annotations/person_keypoints_val2017.json"),
+        ("images", "annotations/any.json"),
+    ],
+)
+def test_coco_is_read(tmp_path, place, path):
+    data = read_coco(write(tmp_path, place, path))
+    assert data.folder.samefile(tmp_path / place) and data.lenses is None and len(data) == 3
+    assert list(data.files) == ["a.png", "sub/b.png", "c.png"]
+    box, polygon, crowd = data.labels(0).things
+    assert data.labels(0).size == SIZE and not data.labels(2).things
+    np.testing.assert_array_equal(box.box, [10, 20, 40, 35])
+    assert box.category == 18 and not len(box.polygons) and box.area == 450
+    assert box.more == {"id": 5, "image_id": 9, "attributes": {"tame": True}}
+    assert [p.shape for p in polygon.polygons] == [(3, 2), (4, 2)]
+    assert polygon.area == pytest.approx(100 + 5)
+    np.testing.assert_array_equal(polygon.keypoints, [[5, 5, 2], [6, 4, 1], [0, 0, 0]])
+    assert list(polygon.mirror) == [0, 2, 1]
+    assert crowd.crowd and crowd.area == 200 and data.labels(1).things[0].area == 200
+
+
+def test_coco_is_written_and_read_again(tmp_path):
+    data = read_coco(write(tmp_path))
+    pictures = [(entry, data.labels(k)) for k, entry in enumerate(data.entries)]
+    write_coco(tmp_path / "again.json", pictures, data.categories)
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["images"] == IMAGES and again["categories"] == CATEGORIES
+    for found, given in zip(again["annotations"], ANNOTATIONS, strict=True):
+        assert found.pop("visible") == 1.0
+        assert found.pop("area") == pytest.approx(given["area"], abs=5)  # 105, which COCO rounds
+        assert found == {key: value for key, value in given.items() if key != "area"}
+    read_coco(tmp_path / "again.json").labels(0)
+
+
+def test_ids_are_numbered_where_they_are_missing(tmp_path):
+    labels = Labels([Thing(1, np.array([1.0, 2, 3, 4])), Thing(1, np.array([1.0, 2, 3, 5]))], SIZE)
+    file = write(tmp_path)
+    write_coco(file, [({"file_name": "a.png"}, labels), ({"file_name": "c.png"}, labels)],
+               CATEGORIES)  # fmt: skip
+    content = json.loads(file.read_text())
+    assert [image["id"] for image in content["images"]] == [1, 2]
+    assert [one["id"] for one in content["annotations"]] == [1, 2, 3, 4]
+    assert [one["image_id"] for one in content["annotations"]] == [1, 1, 2, 2]
+    assert len(read_coco(file).labels(1).things) == 2
+
+
+def test_the_share_that_is_visible_is_kept(tmp_path):
+    data = read_coco(write(tmp_path, **changed(0, visible=0.625)))
+    assert data.labels(0).things[0].visible == 0.625
+    write_coco(tmp_path / "again.json", [(IMAGES[0], data.labels(0))], CATEGORIES)
+    assert json.loads((tmp_path / "again.json").read_text())["annotations"][0]["visible"] == 0.625
+
+
+def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
+    file = write(tmp_path, "train", "annotations/instances_train.json")
+    (tmp_path / "lens.json").write_text('{"model": "Equidistant", "focal": 20, "theta_max": 1}')
+    lenses = read_coco(file).lenses
+    assert lenses is not None and lenses.lens_of("a.png", SIZE).focal == 20
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (changed(0, category_id=3), "the annotation 5 has the category 3, but the categories are"),
+        (changed(1, image_id=77), "the annotation 6 is of the picture 77, which the file does not"),
+        (changed(0, bbox=[1, 2, float("nan"), 3]), "annotation 5 has the box .*finite numbers"),
+        (changed(0, bbox=[1, 2, 3]), "annotation 5 has the box"),
+        (changed(0, bbox=None), "annotation 5 has the box"),
+        (changed(1, segmentation=[[1, 2, 3]]), "annotation 6 has the polygon"),
+        (changed(1, segmentation=[["a", "b"]]), "annotation 6 has the polygon"),
+        (changed(1, keypoints=[1, 2]), "annotation 6 has the keypoints"),
+        (changed(2, segmentation={"size": [3, 4], "counts": [12]}), "a mask of \\[3, 4\\] px"),
+        ({"annotations": [{"id": 1, "image_id": 9, "category_id": 1}]}, "1 has no bbox"),
+        ({"annotations": [{"id": 1}]}, "lacks 'category_id'"),
+        ({"annotations": {}}, 'must have the lists "images"'),
+        ({"categories": [{"name": "dog"}]}, "lacks 'id'"),
+        ({"images": [*IMAGES, IMAGES[0]]}, "lists a picture twice"),
+        ({"images": [IMAGES[0] | {"width": 81}, *IMAGES[1:]]}, "81 × 60 px, but it has 80 × 60"),
+        ({"images": [{"file_name": "d.png", "id": 9}, *IMAGES[1:]]}, r"1 of 3 pictures .*d\.png"),
+    ],
+)
+def test_wrong_coco_files(tmp_path, changes, said):
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        read_coco(write(tmp_path, **changes)).labels(0)
+
+
+def test_boxes_that_are_missing_are_those_of_polygons_and_masks(tmp_path):
+    annotations = [
+        {k: v for k, v in one.items() if k not in ("bbox", "id")} for one in ANNOTATIONS[1:]
+    ]
+    data = read_coco(write(tmp_path, annotations=annotations))
+    polygon, crowd = data.labels(0).things
+    np.testing.assert_array_equal(polygon.box, [1, 2, 21, 12])
+    np.testing.assert_array_equal(crowd.box, [30, 10, 50, 20])
+
+
+def test_empty_coco_files(tmp_path):
+    assert not read_coco(write(tmp_path, annotations=[])).labels(0).things
+    assert len(read_coco(write(tmp_path, images=[], annotations=[], categories=[]))) == 0
+
+
+# -- YOLO -----------------------------------------------------------------------------------------
+
+
+def write_pictures(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), np.zeros((*SIZE, 3), np.uint8))
+
+
+def yolo(folder, text, more=None, names=("person", "dog")):
+    write_pictures(folder, "images/train/a.png", "images/val/b.png")
+    (folder / "labels" / "train").mkdir(parents=True, exist_ok=True)
+    (folder / "labels" / "train" / "a.txt").write_text(text)
+    (folder / "data.yaml").write_text(yaml.safe_dump({"names": list(names)} | (more or {})))
+    return folder
+
+
+def test_yolo_is_read(tmp_path):
+    data = read_yolo(yolo(tmp_path, "1 0.5 0.5 0.25 0.5\n\n0 0.1 0.1 0.5 0.1 0.5 0.9\n"))
+    assert list(data.files) == ["images/train/a.png", "images/val/b.png"]
+    assert data.categories == [{"id": 0, "name": "person"}, {"id": 1, "name": "dog"}]
+    box, polygon = data.labels(0).things
+    np.testing.assert_allclose(box.box, [30, 15, 50, 45])
+    np.testing.assert_allclose(polygon.polygons[0], [[8, 6], [40, 6], [40, 54]])
+    assert (box.category, polygon.category) == (1, 0) and not data.labels(1).things
+
+
+@pytest.mark.parametrize(
+    ("picture", "text", "classes"),
+    [
+        ("images/a.png", "labels/a.txt", "data.yaml"),
+        ("train/images/a.png", "train/labels/a.txt", "data.yaml"),
+        ("a.png", "a.txt", "classes.txt"),
+        ("images/images/a.png", "images/labels/a.txt", "data.yaml"),
+    ],
+)
+def test_where_yolo_has_its_labels(tmp_path, picture, text, classes):
+    write_pictures(tmp_path, picture)
+    (tmp_path / text).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / text).write_text("0 0.5 0.5 1 1\n")
+    names = "names: {0: dog}" if classes == "data.yaml" else "dog\n"
+    (tmp_path / classes).write_text(names)
+    data = open_labels(tmp_path)
+    np.testing.assert_allclose(data.labels(0).things[0].box, [0, 0, 80, 60])
+    write_yolo(tmp_path / "new", [({"file_name": picture}, data.labels(0))], data.categories)
+    assert (tmp_path / "new" / text).read_text() == "0 0.500000 0.500000 1.000000 1.000000\n"
+
+
+def test_yolo_keypoints(tmp_path):
+    data = read_yolo(yolo(tmp_path, "0 .5 .5 .2 .2 .4 .5 2 0 0 0\n", {"kpt_shape": [2, 3]}))
+    (thing,) = data.labels(0).things
+    np.testing.assert_allclose(thing.keypoints, [[32, 30, 2], [0, 0, 0]])
+    write_yolo(tmp_path / "new", [({"file_name": data.files[0]}, data.labels(0))], data.categories)
+    write_pictures(tmp_path / "new", data.files[0])
+    (again,) = read_yolo(tmp_path / "new").labels(0).things
+    np.testing.assert_allclose(again.keypoints, thing.keypoints)
+    flat = read_yolo(yolo(tmp_path, "0 .5 .5 .2 .2 .4 .5 0 0\n", {"kpt_shape": [2, 2]}))
+    np.testing.assert_allclose(flat.labels(0).things[0].keypoints, [[32, 30, 2], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_parts_of_an_outline_are_joined_for_yolo(tmp_path, parts):
+    """What OpenCV fills is the same."""
+    corners = np.array([[4.0, 4], [14, 4], [9, 14]])
+    polygons = [corners + np.array([20, 10]) * k for k in range(parts)]
+    thing = Thing(0, np.array([4.0, 4, 60, 50]), polygons)
+    labels = Labels([thing, Thing(0, thing.box, crowd=True)], SIZE)
+    write_yolo(tmp_path, [({"file_name": "images/a.png"}, labels)], [{"id": 0, "name": "dog"}])
+    write_pictures(tmp_path, "images/a.png")
+    (found,) = read_yolo(tmp_path).labels(0).things  # without the crowd
+    pictures = [
+        cv2.fillPoly(np.zeros(SIZE, np.uint8), [np.round(16 * p).astype(int) for p in shapes], 1,
+                     shift=4)
+        for shapes in (polygons, found.polygons)
+    ]  # fmt: skip
+    bridges = 2 * np.hypot(20, 10) * (parts - 1)
+    assert np.abs(pictures[0].astype(int) - pictures[1]).sum() <= bridges
+    area = cv2.contourArea(found.polygons[0].astype(np.float32))
+    assert area == pytest.approx(50 * parts, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["2 0.5 0.5 1 1", "-1 0.5 0.5 1 1", "0.5 .5 .5 1 1", "0 0.5 0.5 1", "0 0.1 0.1 0.5 0.1 0.5",
+     "0 nan 0.5 1 1", "0 a b c d", "0"],
+)  # fmt: skip
+def test_wrong_lines_of_yolo(tmp_path, line):
+    data = read_yolo(yolo(tmp_path, f"0 0.5 0.5 1 1\n{line}\n"))
+    with pytest.raises(ValueError, match=r"a\.txt, line 2: must be a class below 2 and 4 numbers"):
+        data.labels(0)
+
+
+def test_folders_that_are_not_yolo(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no labels in .*: give a COCO file"):
+        open_labels(tmp_path)
+    write_pictures(tmp_path, "images/a.png")
+    (tmp_path / "data.yaml").write_text("names: [dog]")
+    with pytest.raises(FileNotFoundError, match=r"the first would be .*labels/a\.txt"):
+        read_yolo(tmp_path)
+    (tmp_path / "data.yaml").write_text("names: {1: dog}")
+    with pytest.raises(ValueError, match="must name the classes 0, 1"):
+        read_yolo(tmp_path)
+
+
+# -- WoodScape ------------------------------------------------------------------------------------
+
+
+def test_the_boxes_of_woodscape(tmp_path):
+    data = read_woodscape_boxes(write_woodscape(tmp_path, 4))
+    assert data.files[0] == "00000_FV.png" and data.categories == [{"id": 0, "name": "vehicles"}]
+    (thing,) = data.labels(0).things
+    np.testing.assert_array_equal(thing.box, [10, 10, 41, 41])
+    picture = data.folder / data.files[1]
+    assert data.lenses is not None
+    assert data.lenses.camera_of(picture).calibration.endswith("00001_RV.json")
+    assert len(open_labels(tmp_path)) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("car,0,1,2,3\n", "line 1: must be name,index,left,top,right,bottom"),
+        ("vehicles,0,1,2,nan,4\n", "line 1: must be"),
+        ("person,0,1,2,3,4\n", "names the class 0 person, not vehicles"),
+    ],
+)
+def test_wrong_boxes_of_woodscape(tmp_path, text, said):
+    write_woodscape(tmp_path, 2)
+    folder = tmp_path / "box_2d_annotations" / "box_2d_annotations"
+    (folder / "00001_RV.txt").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_woodscape_boxes(tmp_path)
+    (folder / "00001_RV.txt").write_text("")
+    assert not read_woodscape_boxes(tmp_path).labels(1).things

@@ -1,0 +1,132 @@
+"""Labels of every form go through every view and every lens, and come back, against exact masks."""
+
+import functools
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lens_examples import every_lens
+
+from darswin import boxes as of_boxes
+from darswin.lens import BrownConrady, KannalaBrandt
+from darswin.views import list_views, make_view
+
+OF_PIXELS = sorted(set(list_views()) - {"polar"})
+SIZE = (180, 180)
+HALF = 0.25  # rad, of the cone that is looked at
+
+
+def cone(to_rays, size, middle):
+    """The pixels of (H, W) whose rays are near a direction. Every picture shows them as a disc."""
+    y, x = torch.meshgrid(
+        *(torch.arange(side, dtype=torch.float64) for side in size), indexing="ij"
+    )
+    rays = to_rays(torch.stack((x, y), -1)[None])[0].nan_to_num().numpy()
+    return (rays @ middle > math.cos(HALF)).astype(np.uint8)
+
+
+def box_of(mask):
+    y, x = mask.nonzero()
+    return np.array([[x.min(), y.min(), x.max() + 1, y.max() + 1]], float)
+
+
+def overlap(mask, other):
+    return (mask & other).sum() / (mask | other).sum()
+
+
+def outline(mask):
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return max(contours, key=len)[:, 0].astype(float) + 0.5
+
+
+def filled(polygon, size):
+    return cv2.fillPoly(
+        np.zeros(size, np.uint8), [np.rint((polygon - 0.5) * 16).astype(np.int32)], 1, shift=4
+    )
+
+
+@functools.cache
+def pictures():
+    """For every lens, a picture in which the cone is about 60 pixels wide: the lens, the direction
+    of the cone's axis, and its exact mask."""
+    found = {}
+    for number, (model, (given, _)) in enumerate(every_lens().items()):
+        scale = 24 / given.project(torch.full((1, 1), HALF).double()).item()
+        lens = given.replace(image_size=torch.tensor([[999.0, 999.0]]).double()).resized(scale)
+        lens = lens.replace(center=torch.tensor([[89.0, 91.0]]).double(),
+                            image_size=torch.tensor([SIZE]).double())  # fmt: skip
+        theta, phi = 0.35 * min(lens.theta_max.item(), 1.0), 0.7 + number
+        aside = math.sin(theta)
+        middle = np.array([aside * math.cos(phi), aside * math.sin(phi), math.cos(theta)])
+        found[model] = lens, middle, cone(lens.unproject_points, SIZE, middle)
+    return found
+
+
+def is_whole(mask):
+    return mask.sum() > 300 and mask[1:-1, 1:-1].sum() == mask.sum()
+
+
+@pytest.mark.parametrize("name", OF_PIXELS)
+def test_labels_of_every_form_go_through_every_lens_and_view(name):
+    checked, boxes = set(), []
+    view_size = {"none": SIZE, "panorama": (150, 420)}.get(name, (180, 180))
+    for model, (lens, middle, in_picture) in pictures().items():
+        view = make_view(name, view_size, max_fov=2.0 if name == "perspective" else None)
+        assert is_whole(in_picture)
+        for tile in range(view.count):
+            of_tile = dict(tile=tile) if view.count > 1 else {}
+            arguments = dict(lens=lens, size=SIZE, **of_tile)
+            in_view = cone(lambda p, k=arguments, v=view: v.to_rays(p, **k), view_size, middle)
+            if not is_whole(in_view):
+                continue  # another tile sees it
+            checked.add(model)
+            to_image = lambda p, k=arguments, v=view: v.to_image(p, **k)  # noqa: E731
+            to_view = lambda p, k=arguments, v=view: v.to_view(p, **k)  # noqa: E731
+            for source, target, there, back in (
+                (in_view, in_picture, to_image, to_view),
+                (in_picture, in_view, to_view, to_image),
+            ):
+                where = (model, tile, target.shape)
+                mask = of_boxes.carry_mask(source, back, target.shape)
+                assert overlap(mask, target) > 0.93, where
+                polygon = of_boxes.carry_polygon(outline(source), there)
+                assert overlap(filled(polygon, target.shape), target) > 0.88, where
+                carried, visible = of_boxes.carry(box_of(source), there)
+                boxes.append(of_boxes.iou(carried, box_of(target)).item())
+                assert visible == 1 and boxes[-1] > 0.6, where
+    assert len(checked) >= 0.9 * len(pictures())
+    # The square shears things, and a box does not tell by how much.
+    assert np.mean(boxes) > (0.8 if name == "square" else 0.9)
+
+
+@pytest.mark.parametrize("name", ["mercator", "cylindrical", "tangent"])
+def test_points_of_views_are_those_of_opencv(name):
+    """OpenCV projects the same directions, into the view and into the picture."""
+    camera = np.array([[150.0, 0, 322], [0, 150, 238], [0, 0, 1]])
+    radial, tangential = [-0.1, 0.02], [1e-3, -2e-3]
+    terms, nothing = [0.02, -0.004, 0.001, 0.0], np.zeros(3)
+    places = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 2))  # x/z and y/z of the directions
+    rays = np.concatenate((places, np.ones((40, 1))), -1)[:, None]
+    middle = dict(center=[322.0, 238.0])
+    fisheye = KannalaBrandt(150.0, terms, 1.5, **middle)
+    brown = BrownConrady(150.0, radial, 0.9, **middle, tangential=tangential)
+    theirs = (
+        (fisheye, cv2.fisheye.projectPoints(rays, nothing, nothing, camera, np.array(terms))),
+        (brown, cv2.projectPoints(rays, nothing, nothing, camera, np.array(radial + tangential))),
+    )
+    fov, side = 1.4, 201
+    step = (2 * math.tan(fov / 2) if name == "tangent" else fov) / side
+    warper = cv2.PyRotationWarper("plane" if name == "tangent" else name, 1.0)
+    eye = np.eye(3, dtype=np.float32)
+    flat = np.array([warper.warpPoint(tuple(place), eye, eye) for place in places.tolist()])
+    view, size = make_view(name, (side, side), fov=fov), (480, 640)
+    for lens, (pixels, _) in theirs:
+        exact = lens.to(torch.float64)
+        found = view.to_image(flat / step + (side - 1) / 2, exact, size)
+        np.testing.assert_allclose(found, pixels[:, 0], atol=2e-3)
+        keypoints = of_boxes.carry_points(
+            pixels[:, 0] + 0.5, lambda p, lens=exact: view.to_view(p, lens, size)
+        )
+        np.testing.assert_allclose(keypoints, flat / step + side / 2, atol=2e-3)
