@@ -17,7 +17,7 @@ import numpy as np
 import onnxruntime
 from pretrained_files import MODELS, Files
 from pretrained_graphs import DETECTORS, export
-from pretrained_scenes import LENSES, SIZE, WRONG, Scene, spherical
+from pretrained_scenes import LENSES, SIZE, WRONG, Shot, spherical
 
 from darswin import boxes, frames
 from darswin.lens import Lens
@@ -85,14 +85,14 @@ CONTROLS = {
     "mercator, wrong lens": (Look("mercator", wrong=True),),
     "tiles: 5, wrong lens": (tiles(5, wrong=True),),
 }
-# A camera that looks down; 320 × 800 pixels are as many as 512².
+# A camera that looks down; 288 × 896 pixels are as many as 512².
 DOWN_METHODS = {
     "raw": (RAW,),
     "raw, 1024²": (RAW.resized(1024),),
     "stereographic": (Look("stereographic"),),
     "equirectangular, in the camera's frame": (Look("equirectangular", tilted=True),),
-    "panorama": (Look("panorama", (320, 800)),),
-    "panorama, 640 × 1600": (Look("panorama", (640, 1600)),),
+    "panorama": (Look("panorama", (288, 896)),),
+    "panorama, 576 × 1792": (Look("panorama", (576, 1792)),),
     "tiles: 5": (tiles(5),),
     "ring of 6 tiles": (ring(6, 52, 85),),
     "ring of 6 tiles, level with the picture": (ring(6, 52, 85, tilted=True),),
@@ -181,7 +181,7 @@ def _sampler(
     return frames.Sampler(plan)
 
 
-def sampler_of(look: Look, scene: Scene, detector: Detector) -> frames.Sampler:
+def sampler_of(look: Look, scene: Shot, detector: Detector) -> frames.Sampler:
     """What reads the pictures of a scene's lens for a look."""
     options = dict(look.options)
     if look.view != "square":
@@ -191,7 +191,7 @@ def sampler_of(look: Look, scene: Scene, detector: Detector) -> frames.Sampler:
     return _sampler(look.view, look.size, text, *where)
 
 
-def detect(look: Look, scene: Scene, picture: np.ndarray, detector: Detector) -> Found:
+def detect(look: Look, scene: Shot, picture: np.ndarray, detector: Detector) -> Found:
     """The detections of a look, in the picture's pixels."""
     if look.view == "raw":
         image = cv2.resize(picture, look.size[::-1], interpolation=cv2.INTER_AREA)
@@ -230,7 +230,7 @@ def look_file(folder: Path, look: Look, detector: Detector) -> Path:
 
 
 def found_by(
-    method: tuple[Look, ...], scene: Scene, picture: np.ndarray, detector: Detector, folder: Path
+    method: tuple[Look, ...], scene: Shot, picture: np.ndarray, detector: Detector, folder: Path
 ) -> Found:
     """The detections of a method, which are found once and then read from `folder`."""
     parts = []

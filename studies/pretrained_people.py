@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from pretrained_files import VIDEO, Files
 from pretrained_methods import LEVEL_METHODS, SURE, Detector
-from pretrained_scenes import LENSES, LEVEL, SIZE, WIDE, Billboard, Scene, Thing
+from pretrained_scenes import SIZE, WIDE, Billboard, Shot, Thing
 
 from darswin import boxes
 
@@ -23,15 +23,12 @@ METHODS = {name: LEVEL_METHODS[name] for name in (
 )}  # fmt: skip
 
 
-class People(Scene):
+class People(Shot):
     """A frame of the video before a panorama, through a wide lens."""
 
     def __init__(self, files: Files, index: int) -> None:
-        self.files, self.split, self.index = files, "people", index
-        self.lens_name = WIDE[index % len(WIDE)]
-        self.lens, self.to_world = LENSES[self.lens_name](), LEVEL
-        self.up = np.array([0.0, -1.0, 0.0])
-        self.panorama, self.yaw = "city", 0.0
+        super().__init__(files, WIDE[index % len(WIDE)], "city", 0.0)
+        self.split, self.index = "people", index
         rng = np.random.default_rng([index, *b"people"])
         yaw = rng.uniform(-0.5, 0.5)
         direction = np.array([math.sin(yaw), 0.0, math.cos(yaw)])
@@ -58,16 +55,8 @@ class People(Scene):
         rays = self.window.direction + plane @ np.stack((self.window.right, self.window.down))
         return self.lens.project_points(torch.from_numpy(rays)[None], (SIZE, SIZE))[0].numpy()
 
-    def render(self) -> np.ndarray:
-        boxes_of = [thing.box for thing in self.things]
-        things, self.things = self.things, []  # the window alone is painted
-        picture = super().render()
-        self.things = things
-        for thing, box in zip(things, boxes_of, strict=True):
-            thing.box = box
-        return picture
-
     def picture_of(self, rays: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        picture, _ = super().picture_of(rays)
+        """Without masks: the things are in the window, and have their boxes."""
+        picture = self.background(rays)
         self.window.paint(picture, rays)
         return picture, []

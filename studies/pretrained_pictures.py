@@ -30,7 +30,7 @@ class Pictures:
     def folder(self, split: str, index: int) -> Path:
         return self.out / "scenes" / f"{split}-{index}"
 
-    def scene(self, split: str, index: int) -> Scene:
+    def scene(self, split: str, index: int) -> Scene | People:
         """A scene whose things have boxes."""
         scene = People(self.files, index) if split == "people" else Scene(self.files, split, index)
         folder = self.folder(split, index)

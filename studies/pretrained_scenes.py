@@ -193,20 +193,63 @@ def sampled(image: np.ndarray, places: np.ndarray, border: int = cv2.BORDER_CONS
     return found.reshape(len(padded), -1)[: len(places)]
 
 
-class Scene:
+class Shot:
+    """A panorama through a lens, and the things before it."""
+
+    def __init__(
+        self, files: Files, lens_name: str, panorama: str, yaw: float, to_world: np.ndarray = LEVEL
+    ) -> None:
+        self.files, self.lens_name, self.lens = files, lens_name, LENSES[lens_name]()
+        self.panorama, self.yaw, self.to_world = panorama, yaw, to_world
+        self.up = to_world.T @ np.array([0.0, -1.0, 0.0])
+        self.things: list[Thing] = []
+
+    def board(self, thing: Thing) -> Billboard:
+        return Billboard(self.files.stamp(thing.stamp), thing.direction, self.up, thing.size)
+
+    def picture_of(self, rays: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """The colours (P, 3) of rays (P, 3) in the camera's frame, and the rays of each mask."""
+        picture = self.background(rays)
+        return picture, [self.board(thing).paint(picture, rays) for thing in self.things]
+
+    def background(self, rays: np.ndarray) -> np.ndarray:
+        """The colours (P, 3) of the panorama along rays (P, 3) in the camera's frame."""
+        world = rays @ self.to_world.T.astype(rays.dtype)
+        azimuth = (np.arctan2(world[:, 0], world[:, 2]) + self.yaw) / (2 * math.pi) + 0.5
+        elevation = np.arcsin(world[:, 1].clip(-1, 1)) / math.pi + 0.5
+        image = self.files.panorama(self.panorama)
+        height, width = image.shape[:2]
+        places = np.stack((azimuth % 1 * width - 0.5, elevation * height - 0.5), 1)
+        return sampled(image, places.astype(np.float32), cv2.BORDER_WRAP).astype(np.float32)
+
+    def render(self) -> np.ndarray:
+        """The camera's picture (SIZE, SIZE, 3) uint8 RGB; the things learn their boxes."""
+        side = SIZE * SUBPIXELS
+        rays, seen = camera_rays(self.lens_name)
+        colours, masks = self.picture_of(rays)
+        fine = np.zeros((side * side, 3), np.float32)
+        fine[seen] = colours
+        for thing, mask in zip(self.things, masks, strict=False):  # others know their boxes
+            rows, columns = np.divmod(seen[mask], side)
+            ends = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+            thing.box = np.array(ends) / SUBPIXELS
+        return reduced(fine.reshape(side, side, 3))
+
+
+class Scene(Shot):
     """Things before a panorama, through a lens."""
 
     def __init__(self, files: Files, split: str, index: int) -> None:
         kind = SPLITS[split]
-        self.files, self.split, self.index = files, split, index
-        self.lens_name = kind.lenses[index % len(kind.lenses)]
-        self.lens = LENSES[self.lens_name]()
-        self.to_world = DOWN if kind.looks_down else LEVEL
-        self.up = self.to_world.T @ np.array([0.0, -1.0, 0.0])
         rng = np.random.default_rng([index, *split.encode()])
-        self.panorama = PANORAMAS[rng.integers(len(PANORAMAS))]
-        self.yaw = rng.uniform(0, 2 * math.pi)
-        self.things: list[Thing] = []
+        super().__init__(
+            files,
+            kind.lenses[index % len(kind.lenses)],
+            PANORAMAS[rng.integers(len(PANORAMAS))],
+            rng.uniform(0, 2 * math.pi),
+            DOWN if kind.looks_down else LEVEL,
+        )
+        self.split, self.index = split, index
         while len(self.things) < kind.things:
             self.things = self._placed(rng, kind)
 
@@ -236,38 +279,11 @@ class Scene:
                 break
         return things
 
-    def board(self, thing: Thing) -> Billboard:
-        return Billboard(self.files.stamp(thing.stamp), thing.direction, self.up, thing.size)
-
     def _seen(self, rays: np.ndarray) -> float:
         """The share of rays that land in the picture."""
         points = self.lens.project_points(torch.from_numpy(rays)[None], (SIZE, SIZE))[0]
         inside = (points > -0.5) & (points < SIZE - 0.5)
         return inside.all(-1).double().mean().item()
-
-    def picture_of(self, rays: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """The colours (P, 3) of rays (P, 3) in the camera's frame, and the rays of each mask."""
-        world = rays @ self.to_world.T.astype(rays.dtype)
-        azimuth = (np.arctan2(world[:, 0], world[:, 2]) + self.yaw) / (2 * math.pi) + 0.5
-        elevation = np.arcsin(world[:, 1].clip(-1, 1)) / math.pi + 0.5
-        image = self.files.panorama(self.panorama)
-        height, width = image.shape[:2]
-        places = np.stack((azimuth % 1 * width - 0.5, elevation * height - 0.5), 1)
-        picture = sampled(image, places.astype(np.float32), cv2.BORDER_WRAP).astype(np.float32)
-        return picture, [self.board(thing).paint(picture, rays) for thing in self.things]
-
-    def render(self) -> np.ndarray:
-        """The camera's picture (SIZE, SIZE, 3) uint8 RGB; the things learn their boxes."""
-        side = SIZE * SUBPIXELS
-        rays, seen = camera_rays(self.lens_name)
-        colours, masks = self.picture_of(rays)
-        fine = np.zeros((side * side, 3), np.float32)
-        fine[seen] = colours
-        for thing, mask in zip(self.things, masks, strict=True):
-            rows, columns = np.divmod(seen[mask], side)
-            ends = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-            thing.box = np.array(ends) / SUBPIXELS
-        return reduced(fine.reshape(side, side, 3))
 
     def flat(self, thing: Thing) -> tuple[np.ndarray, np.ndarray]:
         """A flat picture of 90°, (FLAT, FLAT, 3), whose middle is a thing, and its box there."""

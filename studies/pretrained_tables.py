@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
-from pretrained_methods import LEVEL_METHODS, SURE, Found, found_by
-from pretrained_pictures import Pictures, detector_of
-from pretrained_scenes import COCO, Scene
-from pretrained_scores import ZONES, match
+from pretrained_methods import LEVEL_METHODS, SURE, Found, detect, merged
+from pretrained_pictures import detector_of
+from pretrained_scenes import COCO, SIZE, WIDE, Shot
+from pretrained_scores import ZONES
 
 from darswin.bench.machine import machine
 from darswin.bench.record import write
@@ -48,6 +48,8 @@ SPLITS = {
     "people": "CenterNet, people",
     "second": "NanoDet, level",
 }
+# Those in the picture: they alone are without limits on copies (CC0).
+PANORAMAS = ("interior", 4.7), ("sunset", 0.0)
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
@@ -55,7 +57,7 @@ def publish(record: dict, out: Path, folder: Path) -> None:
     record = {key: value for key, value in record.items() if key != "machine"}
     write(folder / "pretrained.json", machine=machine(), **record)
     draw_scores(record["tables"][SPLITS["level"]]["methods"], folder / "pretrained.png")
-    draw_found(record, out, folder / "pretrained_found.png")
+    draw_found(found_in_panoramas(out), folder / "pretrained_found.png")
 
 
 def draw_scores(methods: dict, path: Path) -> None:
@@ -76,50 +78,41 @@ def draw_scores(methods: dict, path: Path) -> None:
     save_figure(figure, path, colors=256)
 
 
-def draw_found(record: dict, out: Path, path: Path) -> None:
-    """Draws what the detector finds in one picture: raw, in a Mercator map, and in five tiles."""
-    pictures, detector = Pictures(out), detector_of(out, "CenterNet")
-    first, count = record["scenes"]["level"]
-    best = None
-    for index in range(first, first + count):
-        scene = pictures.scene("level", index)
-        folder = pictures.folder("level", index)
-        found = {
-            name: found_by(LEVEL_METHODS[name], scene, None, detector, folder) for name in SHOWN
-        }
-        gained = hits(found["tiles: 5"], scene) - hits(found["raw"], scene)
-        if best is None or gained > best[0]:
-            best = gained, index, scene, found
-    assert best is not None
-    _, index, scene, found = best
-    picture = pictures.picture("level", index)
-    figure = page_figure(3.2)
-    for axes, (name, title) in zip(figure.subplots(1, len(SHOWN)), SHOWN.items(), strict=True):
-        axes.imshow(cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA))
-        axes.set_title(title, fontsize=TEXT)
-        axes.set(xticks=[], yticks=[])
-        for thing in scene.things:
-            add_box(axes, thing.box / 2, "white", "")
-        sure = found[name].scores >= SURE
-        order, of_things = match(found[name], scene.things)
-        for row, thing in zip(order, of_things, strict=True):
-            if sure[row]:
-                color = "lime" if thing >= 0 else "red"
-                add_box(axes, found[name].boxes[row] / 2, color, COCO[found[name].labels[row]])
+Row = tuple[np.ndarray, list[Found]]  # a picture, and what is found in each of the ways `SHOWN`
+
+
+def found_in_panoramas(out: Path) -> list[Row]:
+    """What the detector finds in panoramas: raw, in a Mercator map, and in five tiles."""
+    detector, rows = detector_of(out, "CenterNet"), []
+    for panorama, yaw in PANORAMAS:
+        shot = Shot(detector.files, WIDE[2], panorama, yaw)
+        picture = shot.render()
+        rows.append((picture, [
+            merged([detect(look, shot, picture, detector) for look in LEVEL_METHODS[name]])
+            for name in SHOWN
+        ]))  # fmt: skip
+    return rows
+
+
+def draw_found(rows: list[Row], path: Path) -> None:
+    """Draws detections with high scores."""
+    figure = page_figure(5)
+    panels = figure.subplots(len(rows), len(SHOWN), squeeze=False)
+    for line, (picture, ways) in zip(panels, rows, strict=True):
+        for axes, found, title in zip(line, ways, SHOWN.values(), strict=True):
+            axes.imshow(cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA))
+            axes.set(xticks=[], yticks=[])
+            axes.set_title(title, fontsize=TEXT)
+            sure = found.scores >= SURE
+            for box, label in zip(found.boxes[sure], found.labels[sure], strict=True):
+                add_box(axes, box * (512 / SIZE), COCO[label])
     save_figure(figure, path, colors=256)
 
 
-def hits(found: Found, scene: Scene) -> int:
-    """The number of things that are found."""
-    order, of_things = match(found, scene.things)
-    return int(((of_things >= 0) & (found.scores[order] >= SURE)).sum())
-
-
-def add_box(axes: Axes, box: np.ndarray, color: str, text: str) -> None:
+def add_box(axes: Axes, box: np.ndarray, text: str) -> None:
     x, y, right, lower = box
-    axes.add_patch(Rectangle((x, y), right - x, lower - y, fill=False, ec=color, lw=1.2))
-    if text:
-        axes.text(x, y - 3, text, color=color, fontsize=TEXT - 2)
+    axes.add_patch(Rectangle((x, y), right - x, lower - y, fill=False, ec="lime", lw=1.2))
+    axes.text(x, y - 3, text, color="lime", fontsize=TEXT)
 
 
 # -- tables -----------------------------------------------------------------------------------
