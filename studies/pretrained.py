@@ -37,7 +37,7 @@ from pretrained_scores import Resampled, difference, drawn_weights, rows_of, sco
 from pretrained_tables import PAIRS, publish
 
 # The numbers of the scenes: the first one, and how many. Earlier ones chose the layouts of tiles.
-SCENES = {"level": (48, 48), "small": (0, 24), "down": (24, 32), "perspective": (0, 12)}
+SCENES = {"level": (48, 96), "small": (0, 24), "down": (24, 48), "perspective": (0, 12)}
 SECOND = 24  # scenes for the second network
 PEOPLE = 12  # pictures of the video
 FLAT = ("level", "down")  # splits with flat pictures of each thing

@@ -77,6 +77,7 @@ LARGE = {f"{name}, 1024²": (ONE_RUN[name][0].resized(1024),)
          for name in ("raw", "stereographic", "equirectangular", "mercator")}  # fmt: skip
 TILES = {f"tiles: {count}": (tiles(count),) for count in (4, 5, 6, 8, 9)}
 MIXED = {
+    "raw, and mercator": (RAW, MERCATOR),
     "tiles: 4, and mercator": (tiles(4), MERCATOR),
     "tiles: 5, and mercator": (tiles(5), MERCATOR),
     "tiles: 9, and mercator": (tiles(9), MERCATOR),

@@ -39,7 +39,11 @@ PAIRS = (
     ("ring of 6 tiles", "ring of 6 tiles, level with the picture"),
     ("ring of 6 tiles", "tiles: 5"),
 )
-SHOWN = {"raw": "raw", "mercator": "Mercator, one run", "tiles: 5": "five tiles"}
+SHOWN = {
+    "raw": "raw",
+    "mercator": "Mercator, one run",
+    "tiles: 4, and mercator": "Mercator and 4 tiles",
+}
 SPLITS = {
     "level": "CenterNet, level",
     "small": "CenterNet, small",
@@ -49,7 +53,7 @@ SPLITS = {
     "second": "NanoDet, level",
 }
 # Those in the picture: they alone are without limits on copies (CC0).
-PANORAMAS = ("interior", 4.7), ("sunset", 0.0)
+PANORAMAS = ("interior", 0.0), ("interior", 4.7)
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
@@ -74,7 +78,7 @@ def draw_scores(methods: dict, path: Path) -> None:
     axes.set_yticks(places, list(methods))
     axes.set(xlabel="mAP@0.5", ylim=(len(methods) - 0.5, -0.5))
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="lower left")
+    axes.legend(loc="upper right")
     save_figure(figure, path, colors=256)
 
 
@@ -82,7 +86,7 @@ Row = tuple[np.ndarray, list[Found]]  # a picture, and what is found in each of 
 
 
 def found_in_panoramas(out: Path) -> list[Row]:
-    """What the detector finds in panoramas: raw, in a Mercator map, and in five tiles."""
+    """What the detector finds in panoramas, in each of the ways `SHOWN`."""
     detector, rows = detector_of(out, "CenterNet"), []
     for panorama, yaw in PANORAMAS:
         shot = Shot(detector.files, WIDE[2], panorama, yaw)
@@ -96,13 +100,14 @@ def found_in_panoramas(out: Path) -> list[Row]:
 
 def draw_found(rows: list[Row], path: Path) -> None:
     """Draws detections with high scores."""
-    figure = page_figure(5)
+    figure = page_figure(4.2)
     panels = figure.subplots(len(rows), len(SHOWN), squeeze=False)
     for line, (picture, ways) in zip(panels, rows, strict=True):
         for axes, found, title in zip(line, ways, SHOWN.values(), strict=True):
             axes.imshow(cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA))
             axes.set(xticks=[], yticks=[])
-            axes.set_title(title, fontsize=TEXT)
+            if picture is rows[0][0]:
+                axes.set_title(title, fontsize=TEXT)
             sure = found.scores >= SURE
             for box, label in zip(found.boxes[sure], found.labels[sure], strict=True):
                 add_box(axes, box * (512 / SIZE), COCO[label])
@@ -112,7 +117,7 @@ def draw_found(rows: list[Row], path: Path) -> None:
 def add_box(axes: Axes, box: np.ndarray, text: str) -> None:
     x, y, right, lower = box
     axes.add_patch(Rectangle((x, y), right - x, lower - y, fill=False, ec="lime", lw=1.2))
-    axes.text(x, y - 3, text, color="lime", fontsize=TEXT)
+    axes.text(x, y - 5, text, color="lime", fontsize=TEXT, clip_on=True)
 
 
 # -- tables -----------------------------------------------------------------------------------
