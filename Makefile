@@ -52,7 +52,7 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q tests/ops tests/test_frames.py \
+	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_pictures.py \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
@@ -71,7 +71,7 @@ test-asan: build  ## test the operators on every tier with AddressSanitizer and 
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
-	      -m "not unsanitized" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frames.py; \
+	      -m "not unsanitized" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py; \
 	done
 
 fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
@@ -205,7 +205,7 @@ aarch64: $(STAMP) $(AARCH64)/installed  ## cross-compile for ARM (aarch64); the 
 
 test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
 	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(CURDIR)/pyproject.toml \
-	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frames.py
+	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py
 
 clean:  ## remove all build results
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/frames/*.so

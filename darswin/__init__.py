@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from darswin import boxes, compat, frames, lens, models, ops
+    from darswin import boxes, compat, frames, lens, models, ops, views
     from darswin.deploy.optimize import optimize
     from darswin.layers.attention import PolarWindowAttention
     from darswin.models import DarSwin, create_model, list_models, load_model
@@ -33,6 +33,7 @@ __all__ = [
     "ops",
     "optimize",
     "polar_grid",
+    "views",
 ]
 
 # The module of each public name that is no module.

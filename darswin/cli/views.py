@@ -97,7 +97,7 @@ class Look(NamedTuple):
             "cylindrical": 1 / 2,
             # The height of all that the picture shows; narrower views keep this shape.
             "equirectangular": down / max(fov_deg, across),
-            "panorama": 1 / 2.5,
+            "panorama": 1 / 3,
             "square": 1.0,
         }.get(self.view, size[0] / size[1])
         longer = max(aspect, 1.0)

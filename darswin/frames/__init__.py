@@ -59,7 +59,7 @@ class Plan:
         columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
             lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, (H', W') for an
             image, and (n, H', W') for n tiles; a polar image has H' = R·S_r and W' = A·S_φ. If
-            `reads` is above 1, there is a last axis of `reads`² points, row by row.
+            `reads` is above 1, there is a last axis of the points of a pixel, row by row.
         right, lower: the distances of each point from the centre of that pixel, in [0, 1], float32.
         size: (H, W) of the frames.
         output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W') or (n, C, H',

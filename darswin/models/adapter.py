@@ -26,7 +26,8 @@ class LensAdapter(Model[Any]):
     - detections, a dict of "boxes", "scores" and "labels" or a list of such dicts for each picture,
       as torchvision returns them, become a list with a dict for each image: boxes in pixels of the
       images, and "rays" (K, 3), the directions of their middles, and "visible" (K,), the share of
-      each box that the lens sees. The detections of several tiles are merged;
+      each box that the image shows. Their masks and keypoints come back too. The detections of
+      several tiles are merged;
     - other results, such as logits of classes, are returned as they are. A view of n tiles has n
       for each image. Lists, tuples and dicts of results may be nested.
 

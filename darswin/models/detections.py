@@ -41,14 +41,20 @@ def detections_to_images(
     """Carries the detections of the pictures that a view shows to the pixels of the images.
 
     Args:
-        found: for each picture, boxes (K, 4), scores (K,), labels (K,), and any other values (K,
-            ...), which stay as they are. The coordinates are torchvision's.
+        found: for each picture, boxes (K, 4), scores (K,) and labels (K,); and optionally masks
+            (K, 1, H', W') and keypoints (K, P, 3), and other values (K, ...), which stay as they
+            are. The coordinates are torchvision's.
 
     Returns:
         For each image, the same dicts. The boxes are cut at the borders of the image, and those of
         several tiles are merged, the best first. "visible" (K,) is the share of each box that
         the image shows, and boxes that it does not show are left out. "rays" (K, 3) are the
-        directions of the middles in the camera's frame, unless the view ignores the lens.
+        directions of the middles in the camera's frame, unless the view ignores the lens. Masks
+        are resampled to the image. Keypoints that the image does not show are NaN.
+
+    Raises:
+        ValueError: the number of results does not fit, the view is polar, or there are masks of
+            tiles.
     """
     if len(found) % view.count:
         raise ValueError(
@@ -67,6 +73,8 @@ def detections_to_images(
             for tile, part in enumerate(tiles)
         ]
         joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
+        if "masks" in joined:
+            joined["masks"] = _masks_in_image(joined["masks"], view, prepared, k)
         joined["boxes"] = of_boxes.clip(joined["boxes"], prepared.size)
         seen = joined["visible"] > 0
         joined = {name: value[seen] for name, value in joined.items()}
@@ -75,6 +83,18 @@ def detections_to_images(
             joined = {name: value[kept] for name, value in joined.items()}
         results.append(joined)
     return results
+
+
+def _masks_in_image(masks: Tensor, view: View, prepared: Prepared, image: int) -> Tensor:
+    """Masks (K, 1, H', W') of one picture in the pixels of its image, (K, 1, H, W)."""
+    if view.count > 1:
+        raise ValueError("masks of tiles cannot come back: choose a view of one picture")
+    if isinstance(prepared.back, Tensor):
+        number = min(image, len(prepared.back) - 1)
+        prepared = prepared._replace(back=prepared.back[number : number + 1])
+    height, width = prepared.size
+    in_image = view.back(masks.reshape(1, -1, *masks.shape[-2:]), prepared)
+    return in_image.view(*masks.shape[:-2], height, width)
 
 
 def _inside(prepared: Prepared) -> Tensor | None:
@@ -106,10 +126,16 @@ def _carried(
         return dict(found) | dict(visible=torch.ones_like(found["scores"]))
     assert rays is not None
     reads = points.shape[0] // rays.shape[0]
-    carried, visible = of_boxes.carry(
-        boxes, lambda pixels: read_table(points, (pixels + 0.5) * reads - 0.5)
-    )
+
+    def to_image(pixels: np.ndarray) -> np.ndarray:
+        return read_table(points, (pixels + 0.5) * reads - 0.5)
+
+    carried, visible = of_boxes.carry(boxes, to_image)
+    moved = dict(boxes=carried, visible=visible)
+    if "keypoints" in found:
+        places = of_boxes.carry_points(found["keypoints"][..., :2], to_image)
+        moved["keypoints"] = torch.cat((places, found["keypoints"][..., 2:]), -1)
     middle = boxes.detach().double().cpu().unflatten(1, (2, 2)).mean(1).numpy() - 0.5
     inside = np.clip(middle, 0, [rays.shape[1] - 1, rays.shape[0] - 1])
     ray = torch.from_numpy(read_table(rays, inside)).to(boxes)
-    return dict(found) | dict(boxes=carried, visible=visible, rays=F.normalize(ray, dim=1))
+    return dict(found) | moved | dict(rays=F.normalize(ray, dim=1))

@@ -251,10 +251,10 @@ class RayView(PixelView):
             return begins[:, :, None] + (ends - begins)[:, :, None] * share[..., None]
 
         def sees(share: Tensor) -> Tensor:
-            points = at(share)
-            return self._sees(lens, points.flatten(1, 2), size).unflatten(1, points.shape[1:3])
+            return self._sees(lens, at(share), size)
 
-        count = sees(shares[None, None]).int().cumprod(2).sum(2, keepdim=True)
+        # As a cumulative product, which ONNX lacks.
+        count = ((~sees(shares[None, None])).int().cumsum(2) == 0).sum(2, keepdim=True)
         low, high = (shares[(count + k).clamp(0, _STEPS - 1)] for k in (-1, 0))
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
@@ -263,7 +263,7 @@ class RayView(PixelView):
         return at(low)[:, :, 0]
 
     def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:
-        """True where images of (H, W) show points (N or 1, K, 2) of the plane, (N, K)."""
+        """True where images of (H, W) show points (N or 1, ..., 2) of the plane, (N, ...)."""
         pixels = self.place(lens, self.from_plane(points) @ self._turn(points).T, size)
         last = tensor_there((size[1] - 0.5, size[0] - 0.5), pixels)
         return ((pixels >= -0.5) & (pixels <= last)).all(-1)
@@ -315,6 +315,8 @@ def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> 
         if torch.linalg.cross(ahead_of_level, above).norm() < 1e-6:
             ahead_of_level = torch.tensor(AXIS, dtype=torch.float64)
         right = torch.linalg.cross(ahead_of_level, above)
+    axis = above if upright else ahead
+    right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
     right = right / right.norm()
     down = -above if upright else torch.linalg.cross(ahead, right)
     forward = torch.linalg.cross(right, down) if upright else ahead

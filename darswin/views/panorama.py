@@ -11,7 +11,7 @@ class PanoramaView(MercatorView):
     """All directions around the vertical, as a Mercator map: for cameras that look down or up.
 
     The view is 360° wide. Its rows show what the lens sees, as far as its height allows and near
-    the horizon first; sizes with W' = 2.5 H' suit a camera that looks straight down. Give `up`
+    the horizon first; sizes with W' = 3 H' suit a camera that looks straight down. Give `up`
     unless the camera stands upright.
 
     The arguments and errors are those of `RayView`, but `fov` is 2π.

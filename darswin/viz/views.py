@@ -1,6 +1,6 @@
 """Undistorted pictures: an image as a view of `darswin.views` shows it, sampled with OpenCV.
 
-A view such as `TangentView` says where its pixels look, and `undistort` samples an image there:
+A view such as `TangentView` says where its pixels look, and `undistort` samples an image there::
 
     view = make_view("tangent", (480, 640), fov=1.6, **turned(yaw=0.7))
     picture = undistort(image, lens, view)

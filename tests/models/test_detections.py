@@ -137,9 +137,43 @@ class _Constant(nn.Module):
         self.found = boxes
 
     def forward(self, x):
+        return self.found_dict()
+
+    def found_dict(self):
         count = len(self.found)
         return dict(boxes=self.found, scores=torch.linspace(1, 0.5, count),
                     labels=torch.zeros(count, dtype=torch.long))  # fmt: skip
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", sorted(set(VIEWS) - {"tiles"}))
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_masks_and_keypoints_come_back_with_the_boxes(name, lens):
+    images, exact = disks(lens)
+    view = make_view(name, SIZE if name == "none" else (480, 480))
+
+    class Segments(Disks):
+        def forward(self, x):
+            (found,) = super().forward(x)
+            found["masks"] = x[0, found["labels"], None].clamp(0, 1)
+            middles = found["boxes"].unflatten(1, (2, 2)).mean(1)
+            found["keypoints"] = torch.cat((middles, torch.ones(len(middles), 1)), 1)[:, None]
+            return [found]
+
+    (found,) = LensAdapter(Segments("list"), view=view)(images, lens)
+    assert found["masks"].shape == (len(found["labels"]), 1, *SIZE)
+    for label, mask, keypoint in zip(*(found[k] for k in ("labels", "masks", "keypoints")),
+                                     strict=True):  # fmt: skip
+        there, true = mask[0] > 0.5, images[0, label] > 0.5
+        if name == "perspective" and lens.theta_max > 1.5:
+            continue  # the middle is a few pixels
+        if name == "tangent" and label > 1:
+            continue  # the view ends at 50°
+        assert (there & true).sum() / (there | true).sum() > 0.87
+        assert keypoint[0, 2] == 1
+        middle = exact[label].unflatten(0, (2, 2)).mean(0)
+        size = (exact[label, 2:] - exact[label, :2]).max()
+        assert (keypoint[0, :2] - middle).norm() < 0.15 * size
 
 
 @torch.no_grad()
@@ -163,6 +197,9 @@ def test_detections_that_do_not_fit_are_refused():
     network = _Constant(torch.zeros(1, 4))
     with pytest.raises(ValueError, match="for all 5 tiles of each image, got 1 results"):
         LensAdapter(network, 64, view="tiles")(images, lens)
+    masks = dict(network.found_dict(), masks=torch.zeros(1, 1, 64, 64))
+    with pytest.raises(ValueError, match="masks of tiles cannot come back"):
+        LensAdapter(network, 64, view="tiles", boxes=lambda _: [masks] * 5)(images, lens)
     with pytest.raises(ValueError, match="a polar image"):
         LensAdapter(network, 64, view="polar")(images, lens)
 

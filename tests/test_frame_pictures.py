@@ -1,0 +1,133 @@
+"""Plans of pictures: several reads of a pixel, several tiles, and points that go to the frame."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from frame_samples import random_frame
+from hypothesis import given
+from hypothesis import strategies as st
+
+from darswin import frames
+from darswin.lens import Equidistant, KannalaBrandt
+from darswin.views import make_view
+
+SIZE = (120, 160)
+LENS = KannalaBrandt(40.0, [0.01], math.radians(95), center=[81.0, 58.0])
+MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
+
+
+def by_numpy(plan, frame):
+    """The mean of bilinear samples in float64, with normalized zeros outside of the frame."""
+    pixels = frame.reshape(*frame.shape[:2], -1).astype(np.float64)
+    if plan.output == "image":
+        pixels = (pixels / 255 - np.array(plan.mean)) / np.array(plan.std)
+    padded = np.pad(pixels, ((4, 4), (4, 4), (0, 0)))
+    x, y = plan.columns + 4, plan.rows + 4
+    right, lower = plan.right[..., None].astype(float), plan.lower[..., None].astype(float)
+    upper = padded[y, x] * (1 - right) + padded[y, x + 1] * right
+    under = padded[y + 1, x] * (1 - right) + padded[y + 1, x + 1] * right
+    found = upper * (1 - lower) + under * lower
+    if plan.reads > 1:
+        found = found.mean(-2)
+    if plan.output == "image":
+        return np.moveaxis(found, -1, -3)
+    return found if frame.ndim == 3 else found[..., 0]
+
+
+@st.composite
+def plans(draw):
+    """A plan with points inside, at the border and outside of its frame."""
+    height, width = draw(st.sampled_from((1, 2, 3, 16, 50))), draw(st.sampled_from((1, 2, 7, 60)))
+    reads = draw(st.sampled_from((1, 2, 3, 5, 16)))
+    shape = (draw(st.sampled_from((1, 2, 9))), draw(st.sampled_from((1, 3, 40))))
+    if draw(st.booleans()):
+        shape = (draw(st.integers(1, 4)), *shape)
+    shape += (reads**2,) * (reads > 1)
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    columns, rows = (rng.integers(-1, side, shape, dtype=np.int16) for side in (width, height))
+    outside = rng.random(shape) < draw(st.sampled_from((0.0, 0.01, 1.0)))
+    columns, rows = (np.where(outside, np.int16(-3), places) for places in (columns, rows))
+    right, lower = rng.random((2, *shape), dtype=np.float32)
+    output = draw(st.sampled_from(("image", "uint8")))
+    gray = draw(st.booleans())
+    mean, std = ((0.3,), (0.7,)) if gray else (MEAN, STD)
+    plan = frames.Plan(columns, rows, right, lower, (height, width), output, mean, std, reads)
+    return plan, random_frame(height, width, *(() if gray else (3,)), seed=draw(st.integers(0, 9)))
+
+
+@given(plans(), st.integers(1, 4))
+def test_pixels_are_the_means_of_their_points(call, threads):
+    plan, frame = call
+    sampler = frames.Sampler(plan)
+    found, expected = sampler(frame, threads=threads), by_numpy(plan, frame)
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(found, expected, atol=0.51 if plan.output == "uint8" else 2e-5)
+    out = np.empty_like(found)
+    assert sampler(frame, out) is out
+    np.testing.assert_array_equal(out, found)  # on any number of threads
+
+
+@pytest.mark.parametrize("name", ["tiles", "mercator", "panorama", "square", "perspective"])
+@pytest.mark.parametrize("output", ["image", "uint8"])
+def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
+    options = {} if name in ("square", "perspective") else dict(reads=2, up=(0.1, -1, 0.2))
+    mean, std = (MEAN, STD) if output == "image" else (0.0, 1.0)  # bytes are not normalized
+    view = make_view(name, (48, 48), mean=mean, std=std, **options)
+    plan = frames.plan(view, LENS, SIZE, output=output)
+    frame = random_frame(*SIZE, 3)
+    found = frames.Sampler(plan)(frame)
+    seen = view(torch.from_numpy(frame)[None], LENS).numpy()
+    seen = seen if name == "tiles" else seen[0]
+    if output == "uint8":
+        seen = np.moveaxis(seen, -3, -1) * 255
+    assert found.shape == seen.shape
+    np.testing.assert_allclose(found, seen, atol=3e-3 if output == "image" else 0.6)
+    plan.save(tmp_path / "plan.npz")
+    again = frames.Plan.load(tmp_path / "plan.npz")
+    assert again == plan and again.reads == plan.reads == (2 if options else 1)
+    np.testing.assert_array_equal(frames.Sampler(again)(frame), found)
+
+
+@pytest.mark.parametrize("name", ["tiles", "mercator", "square", "perspective", "tangent"])
+@pytest.mark.parametrize("reads", [1, 3])
+def test_points_of_a_plan_are_those_of_the_lens(name, reads):
+    options = dict(square={}, perspective=dict(max_fov=2.0)).get(name, dict(reads=reads))
+    view = make_view(name, (200, 240) if name != "square" else (200, 200), mean=0, std=1, **options)
+    plan, exact = frames.plan(view, LENS, SIZE), LENS.to(torch.float64)
+    points = np.random.default_rng(0).uniform(-0.5, 199.5, (500, 2))
+    for tile in range(view.count):
+        of_tile = dict(tile=tile) if view.count > 1 else {}
+        found, expected = (
+            plan.points(points, **of_tile),
+            view.to_image(points, exact, SIZE, **of_tile),
+        )
+        seen = ~np.isnan(found).any(-1)
+        inside = ((expected > 1) & (expected < [158, 118])).all(-1)
+        assert seen[inside].mean() > 0.95 and seen.mean() > 0.05
+        np.testing.assert_allclose(found[seen], expected[seen], atol=0.2)
+        if name != "square":  # whose map has corners
+            np.testing.assert_allclose(found[seen], expected[seen], atol=4e-3)
+        far = plan.points(np.array([[-0.6, 5.0], [5.0, 200.0], [np.nan, 3.0]]), **of_tile)
+        assert np.isnan(far).all()
+    assert plan.points(np.zeros((0, 2))).shape == (0, 2)
+    assert plan.points(np.zeros((2, 3, 2))).shape == (2, 3, 2)
+
+
+def test_plans_that_do_not_fit_are_refused():
+    places = np.zeros((4, 5, 4), np.int16), np.zeros((4, 5, 4), np.int16)
+    parts = np.zeros((4, 5, 4), np.float32), np.zeros((4, 5, 4), np.float32)
+    frames.Sampler(frames.Plan(*places, *parts, (8, 9), "image", reads=2))
+    for output, reads in (("image", 3), ("image", 0), ("image", 17), ("tokens", 2), ("image", -1)):
+        with pytest.raises(ValueError, match="do not fit together"):
+            frames.Sampler(frames.Plan(*places, *parts, (8, 9), output, reads=reads))
+    with pytest.raises(ValueError, match="tokens has no pixels"):
+        tokens = [array.reshape(2, 2, 5, 4) for array in (*places, *parts)]
+        frames.Plan(*tokens, (8, 9), "tokens").points(np.zeros((1, 2)))
+    view = make_view("tiles", (8, 8))
+    with pytest.raises(IndexError):
+        frames.plan(view, Equidistant(40.0, 1.5), SIZE).points(np.zeros((1, 2)), tile=5)
+    with pytest.raises(ValueError, match="sees nothing of the lens"):
+        narrow = make_view("tangent", (8, 8), direction=(0, 0, -1))
+        frames.plan(narrow, Equidistant(40.0, 1.5), SIZE)
