@@ -278,7 +278,7 @@ def test_the_study_of_pretrained_detectors_shows_its_point():
         f"{score('mercator, 1024²')}.",
         f"Five tiles have {score('tiles: 5')} mAP. Their recall is "
         f"{score('tiles: 5', key='recall')}, against {score('mercator, 1024²', key='recall')}",
-        f"4 tiles and a Mercator map, {score('tiles: 4, and mercator')},",
+        f"4 tiles and a Mercator map, {score('tiles: 4, and mercator')}:",
         f"ten runs, have {score('tiles: 9, and mercator')}.",
         f"five find {100 * level['tiles: 5']['of_flat']:.0f} %",
         f"five tiles find {100 * level['tiles: 5']['same_as_flat']:.0f} % and nine "
