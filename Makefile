@@ -122,7 +122,7 @@ study-dense: build  ## study labels and distances through unknown lenses (5 hour
 study-sizes: build  ## study distances that only the lens and the size of balls reveal (half an hour; can be interrupted)
 	$(BIN)/python studies/sizes.py
 
-study-pretrained: build  ## study detectors for ordinary photographs on fisheye pictures (40 minutes; needs npm and apt-get)
+study-pretrained: build  ## study detectors for ordinary photographs on fisheye pictures (half an hour; needs npm and apt-get)
 	$(BIN)/python studies/pretrained_files.py
 	$(BIN)/python studies/pretrained.py
 

