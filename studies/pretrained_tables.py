@@ -53,7 +53,7 @@ SPLITS = {
     "second": "NanoDet, level",
 }
 # Those in the picture: they alone are without limits on copies (CC0).
-PANORAMAS = ("interior", 0.0), ("interior", 4.7)
+PANORAMAS = ("city", 0.0), ("interior", 0.0)
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
@@ -78,7 +78,7 @@ def draw_scores(methods: dict, path: Path) -> None:
     axes.set_yticks(places, list(methods))
     axes.set(xlabel="mAP@0.5", ylim=(len(methods) - 0.5, -0.5))
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="upper right")
+    axes.legend(loc="lower right")
     save_figure(figure, path, colors=256)
 
 
@@ -100,7 +100,7 @@ def found_in_panoramas(out: Path) -> list[Row]:
 
 def draw_found(rows: list[Row], path: Path) -> None:
     """Draws detections with high scores."""
-    figure = page_figure(4.2)
+    figure = page_figure(4.4)
     panels = figure.subplots(len(rows), len(SHOWN), squeeze=False)
     for line, (picture, ways) in zip(panels, rows, strict=True):
         for axes, found, title in zip(line, ways, SHOWN.values(), strict=True):
@@ -108,9 +108,11 @@ def draw_found(rows: list[Row], path: Path) -> None:
             axes.set(xticks=[], yticks=[])
             if picture is rows[0][0]:
                 axes.set_title(title, fontsize=TEXT)
-            sure = found.scores >= SURE
-            for box, label in zip(found.boxes[sure], found.labels[sure], strict=True):
-                add_box(axes, box * (512 / SIZE), COCO[label])
+            best = np.argsort(-found.scores)[: (found.scores >= SURE).sum()]
+            named: set[int] = set()  # the best box of each class has its name
+            for box, label in zip(found.boxes[best], found.labels[best], strict=True):
+                add_box(axes, box * (512 / SIZE), "" if label in named else COCO[label])
+                named.add(label)
     save_figure(figure, path, colors=256)
 
 

@@ -291,6 +291,10 @@ def test_the_study_of_pretrained_detectors_shows_its_point():
         f"{score('ring of 6 tiles, level with the picture', down)}.",
     ):
         assert sentence in results, sentence
+    readme = " ".join(README.split())
+    assert f"has [{score('raw')} mAP](docs/study_pretrained.md) on the picture itself" in readme
+    assert f"{score('mercator')} on one Mercator view of as many pixels" in readme
+    assert f"and {score('tiles: 5')} on five tiles." in readme
     assert level["tiles: 6"]["of_flat"] >= 1
     for tiles in ("tiles: 4 of 256²", "tiles: 5 of 224²"):
         assert level[tiles]["map"] < level["raw"]["map"]
