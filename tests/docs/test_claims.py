@@ -295,6 +295,22 @@ def test_the_study_of_pretrained_detectors_shows_its_point():
     assert f"has [{score('raw')} mAP](docs/study_pretrained.md) on the picture itself" in readme
     assert f"{score('mercator')} on one Mercator view of as many pixels" in readme
     assert f"and {score('tiles: 5')} on five tiles." in readme
+    page = (ROOT / "docs/explanation/views.md").read_text()
+    large = {view: score(f"{view}, 1024²") for view in ("raw", "stereographic", "mercator")}
+    assert score("stereographic") == score("cylindrical")
+    assert score("equirectangular, 1024²") == large["stereographic"]
+    for row in (
+        f'| the picture, `"none"` | {score("raw")} | {large["raw"]} |',
+        f'| `"perspective"` of 120° | {score(flat)} | |',
+        f'| `"square"` | {score(square)} | |',
+        f'| `"stereographic"`, `"cylindrical"` | {score("cylindrical")} | '
+        f"{large['stereographic']} (stereographic) |",
+        f'| `"equirectangular"` | {score("equirectangular")} | {large["stereographic"]} |',
+        f'| `"mercator"` | {score("mercator")} | {large["mercator"]} |',
+        f'| `"tiles"`, 5 / 9 | {score("tiles: 5")} / {score("tiles: 9")} | |',
+        f"({score('ring of 6 tiles', down)} against {score('tiles: 5', down)} mAP in",
+    ):
+        assert row in page, row
     assert level["tiles: 6"]["of_flat"] >= 1
     for tiles in ("tiles: 4 of 256²", "tiles: 5 of 224²"):
         assert level[tiles]["map"] < level["raw"]["map"]
