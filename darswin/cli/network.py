@@ -59,6 +59,8 @@ class NetworkAnswers(Answers):
         for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
             given = ",".join(f"{value:g}" for value in values)
             check(name, given, all(map(math.isfinite, values)), "finite")
+        for value in mean or ():
+            check("mean", f"{value:g}", abs(value) <= 1, "in parts of 255, at most 1")
         make = partial(
             named_view, "view", view or VIEW, fov_deg=fov_deg, up=up, mean=mean or (0.0,),
             std=std or (1.0,),

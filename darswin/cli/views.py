@@ -30,8 +30,9 @@ View = Literal[
     "square",
 ]  # fmt: skip
 Up = tuple[float, float, float]
-_RAY_VIEWS: dict[View, type[RayView]] = {
+_RAY_VIEWS: dict[str, type[RayView]] = {
     "perspective": TangentView,
+    "tangent": TangentView,
     "cylindrical": CylindricalView,
     "equirectangular": EquirectangularView,
     "mercator": MercatorView,
@@ -58,20 +59,10 @@ class Look(NamedTuple):
             check(name, angle, -360 <= angle <= 360, "from -360° to 360°")
             ahead = "0 for a square view, which looks along the optical axis"
             check(name, angle, self.view != "square" or angle == 0, ahead)
-        if self.up is not None:
-            vector = 0 < math.hypot(*self.up) < math.inf
-            check("up", self.up, vector, "three finite numbers that are not all 0")
-            check("up", self.up, self.view != "square", "left out for a square view")
-        if self.fov_deg is None:
-            return
-        widest = _RAY_VIEWS.get(self.view, RayView).widest
-        most = f"above 0° and at most {math.degrees(widest):.4g}° for a {self.view} view"
-        check("fov_deg", self.fov_deg, 0 < math.radians(self.fov_deg) <= widest, most)
-        whole = self.view != "panorama" or self.fov_deg == 360
+        _check_fov_and_up(self.view, self.fov_deg, self.up)
+        check("up", self.up, self.view != "square" or self.up is None, "left out for a square view")
+        whole = self.view != "panorama" or self.fov_deg in (None, 360)
         check("fov_deg", self.fov_deg, whole, "360° for a panorama view")
-        if self.fov_deg <= 2 * math.pi:
-            text = f"--fov_deg {self.fov_deg:g} is a narrow view; {self.fov_deg:g} rad would be "
-            warnings.warn(f"{text}{math.degrees(self.fov_deg):.4g}°", NarrowView, stacklevel=2)
 
     def shape(self, lens: Lens, size: tuple[int, int], side: int) -> tuple[float, tuple[int, int]]:
         """The field of view, in degrees, and (H, W) of a view whose longer side has `side` px.
@@ -117,6 +108,21 @@ class Look(NamedTuple):
         return _RAY_VIEWS[self.view](size, fov, **turn)
 
 
+def _check_fov_and_up(view: str, fov_deg: float | None, up: Sequence[float] | None) -> None:
+    """ValueError for values out of their ranges; a warning for radians in place of degrees."""
+    if up is not None:
+        vector = len(up) == 3 and 0 < math.hypot(*up) < math.inf
+        check("up", up, vector, "three finite numbers that are not all 0")
+    if fov_deg is None:
+        return
+    widest = _RAY_VIEWS.get(view, RayView).widest
+    most = f"above 0° and at most {math.degrees(widest):.4g}° for a {view} view"
+    check("fov_deg", fov_deg, 0 < math.radians(fov_deg) <= widest, most)
+    if fov_deg <= 2 * math.pi:
+        text = f"--fov_deg {fov_deg:g} is a narrow view; {fov_deg:g} rad would be "
+        warnings.warn(f"{text}{math.degrees(fov_deg):.4g}°", NarrowView, stacklevel=3)
+
+
 def to_corners(lens: Lens) -> Lens:
     """A pinhole camera up to the corners of its picture, since it has no image circle; another
     lens, or a distorted one with a θ_max of its own, as it is."""
@@ -135,18 +141,18 @@ def named_view(
     up: Sequence[float] | None, mean: Sequence[float] = (0.0,), std: Sequence[float] = (1.0,),
 ) -> PixelView:  # fmt: skip
     """The view NAME or NAME:COUNT of (H, W) that a `parameter` names, for networks."""
-    name, _, count = spec.partition(":")
+    name, colon, count = spec.partition(":")
+    _check_fov_and_up(name, fov_deg, up)
     options: dict[str, Any] = {
         key: values[0] if len(values) == 1 else values
         for key, values in (("mean", mean), ("std", std))
     }
     if up is not None:
         options["up"] = up
-    if count:
+    if colon:
         check(parameter, spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
         options["count"] = int(count)
     if fov_deg is not None:
-        check("fov_deg", fov_deg, 0 < fov_deg <= 360, "above 0° and at most 360°")
         options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
     try:
         view = make_view(name, size, **options)

@@ -97,10 +97,16 @@ def warp(
         raise naming(ValueError(text), "lens")
     if is_below(out, source):
         raise ValueError(f"--out must be a folder outside of {source}, got {out}")
+    if outside := [file for file in data.files if os.path.isabs(file) or ".." in Path(file).parts]:
+        raise ValueError(
+            f"{source} names pictures outside of the folder {data.folder}, such as {outside[0]}: "
+            "name them relative to their folder"
+        )
     in_yolo = is_yolo(Path(source))
     settings = dict(
         source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
-        camera=camera, coefficients=coefficients,
+        camera=camera, coefficients=coefficients, pictures=os.path.abspath(data.folder),
+        cameras=data.lenses.digest(),
         target=to_dict(target) if isinstance(target, Lens) else None,
     )  # fmt: skip
     folder = _claim(out, settings)
@@ -286,7 +292,7 @@ def _claim(out: str, settings: dict[str, Any]) -> Path:
         if before != record:
             raise ValueError(
                 f"--out {out} holds other files: give a new or an empty folder, or one of an "
-                "earlier run of the same command, which then goes on"
+                "earlier run of the same command with the same calibrations, which then goes on"
             )
         remove_partial_files(folder)
     replace_file(folder / RECORD, json.dumps(record, indent=1, ensure_ascii=False))

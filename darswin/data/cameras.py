@@ -1,5 +1,6 @@
 """The lens of each picture: one calibration for all, a lenses.json, or a file for each picture."""
 
+import hashlib
 import json
 import os
 import re
@@ -167,6 +168,20 @@ class Calibrations:
         """Raises the errors of `lens_of`, while lenses are few enough to be kept for it."""
         if len(self._lenses) < _KEPT:
             self.lens_of(picture, size, orientation)
+
+    def digest(self) -> str:
+        """The SHA-256 of what all calibrations say, and of which picture has which camera."""
+        contents = {
+            camera.calibration: camera.calibration.encode()
+            if is_json(camera.calibration)
+            else Path(camera.calibration).read_bytes()
+            for camera in self.cameras
+        }
+        total = hashlib.sha256()
+        for place, camera in (self._own | self._places).items():
+            said = str(place), camera.camera, camera.coefficients
+            total.update(repr(said).encode() + contents[camera.calibration])
+        return total.hexdigest()
 
     def lens_alone(self, picture: str | Path | None) -> Lens:
         """The lens of a picture that cannot be read, at the size of the calibration."""

@@ -114,11 +114,12 @@ class Plan:
             tile: the number of the tile, if the plan has tiles.
 
         Returns:
-            (..., 2) float64, NaN where nothing is seen. It differs from the lens by a few
-            thousandths of a pixel, as places between pixels are read bilinearly.
+            (..., 2) float64, NaN where nothing is seen. Places between pixels are read bilinearly.
+            For pictures of at least 256 pixels along rays, such as tiles, this differs from the
+            lens by a few thousandths of a pixel; for small ones and squares, by more.
 
         Raises:
-            ValueError: the plan has tokens, which have no pixels.
+            ValueError: the points have another shape, or the plan has tokens, which have no pixels.
             IndexError: there is no such tile.
         """
         return read_table(self._tables[tile], (np.asarray(points) + 0.5) * self.reads - 0.5)

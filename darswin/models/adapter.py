@@ -53,7 +53,8 @@ class LensAdapter(Model[Any]):
     Raises:
         ValueError: the size is below 1, an option of the view is wrong, the output is unknown, or
             mean and std do not fit together; in forward, the number of detections does not fit.
-        TypeError: in forward, images of uint8 without mean and std.
+        TypeError: in forward, images of uint8 without mean and std, or results of `boxes` that are
+            no detections.
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
     """
@@ -107,8 +108,19 @@ class LensAdapter(Model[Any]):
             results = self.boxes(results)
         if self.output == "view":
             return results
-        if (found := find_detections(results)) is not None:
+        found = find_detections(results)
+        if found is not None:
+            if len(found) != len(x):
+                raise ValueError(
+                    f"the network must give detections for each of its {len(x)} pictures, got "
+                    f"{len(found)} results"
+                )
             return detections_to_images(found, self.view, prepared)
+        if self.boxes is not None and len(x):
+            raise TypeError(
+                "boxes must return a dict of tensors boxes, scores and labels, or a list of them, "
+                f"got {type(results).__name__}"
+            )
 
         def to_images(out: Any) -> Any:
             has_pixels = isinstance(out, Tensor) and out.dim() == 4

@@ -94,7 +94,7 @@ def as_int(value: Any) -> int | None:
         return None
 
 
-def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
+def check_pair(name: str, value: Any, lowest: int) -> tuple[int, int]:
     """The pair, checked: raises TypeError or ValueError unless it is two ints ≥ `lowest`."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
@@ -110,7 +110,7 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
 
 def side_or_pair(name: str, size: int | Sequence[int]) -> tuple[int, int]:
     """(H, W) of at least 1, from such a pair or the side of a square; else as `check_pair`."""
-    return check_pair(name, (size, size) if isinstance(size, int) else size, lowest=1)
+    return check_pair(name, (size, size) if as_int(size) is not None else size, lowest=1)
 
 
 def check_has_batch(

@@ -7,9 +7,12 @@ def read_table(table: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The values of a table (H, W, K) at points x, y (..., 2), bilinearly: (..., K) float64.
 
     The entries are at whole numbers. The table goes on in a straight line for half a step beyond
-    its border. It is NaN farther outside, and beside entries that are NaN.
+    its border. It is NaN farther outside, and beside entries that are NaN. ValueError for points of
+    another shape.
     """
     points = np.asarray(points, np.float64)
+    if points.shape[-1:] != (2,):
+        raise ValueError(f"points must have shape (..., 2), got {points.shape}")
     height, width, count = table.shape
     x, y = np.moveaxis(points, -1, 0).reshape(2, -1)
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)  # not for NaN

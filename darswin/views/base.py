@@ -13,6 +13,7 @@ from darswin.ops.checks import (
     FRAME_CHANNELS,
     channels_first,
     check_has_batch,
+    check_pair,
     per_channel,
     readable,
     tensor_there,
@@ -176,7 +177,11 @@ class View(nn.Module):
 
     def floating(self, images: Tensor, dtype: torch.dtype) -> Tensor:
         """The images in floating point: uint8 images are normalized, others stay as they are."""
-        return self.normalized(images, dtype) if images.dtype == torch.uint8 else images
+        if images.dtype == torch.uint8:
+            return self.normalized(images, dtype)
+        if not images.is_floating_point():
+            raise TypeError(f"images must be uint8 or in floating point, got {images.dtype}")
+        return images
 
     def normalized(self, images: Tensor, dtype: torch.dtype) -> Tensor:
         """`(image - mean) / std` for each channel, in `dtype`; uint8 images are divided by 255."""
@@ -195,13 +200,15 @@ class PixelView(View):
     """A view whose pixels are pixels of the images. A subclass says which: three maps of points.
 
     Args:
-        size: (H', W') of the view; None for the size of the images.
+        size: (H', W') of the view; None for the size of the images, if the view ignores its lens.
     """
 
     def __init__(
         self, size: Pair | None, *, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0
     ):
         super().__init__(mean, std)
+        if size is not None or self.uses_lens:
+            size = check_pair("size", size, 1)
         self.size = size
 
     def image_points(self, lens: Any, size: Pair) -> Tensor | None:
@@ -240,13 +247,13 @@ class PixelView(View):
         Returns:
             Points as given, which may be outside of the image; NaN where no ray lands.
         """
-        return _exactly(points, lens, lambda pixels, exact: exact.project_points(
+        return _exactly(points, lens, size, lambda pixels, exact: exact.project_points(
             self.to_rays(pixels, exact, size, **of_tile), size))  # fmt: skip
 
     def to_view(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
         """Pixels (..., 2) of images of (H, W) → pixels (..., 2) of the view: the inverse of
         `to_image`, with its arguments."""
-        return _exactly(points, lens, lambda pixels, exact: self.to_points(
+        return _exactly(points, lens, size, lambda pixels, exact: self.to_points(
             exact.unproject_points(pixels, size), exact, size, **of_tile))  # fmt: skip
 
     def prepare(
@@ -303,10 +310,14 @@ class PixelView(View):
         return f"size={self.size}"
 
 
-def _exactly(points: Points, lens: Lens, move: Callable[[Tensor, Lens], Tensor]) -> Points:
-    """Moves points (..., 2) through one lens in float64."""
-    if len(lens) != 1:
+def _exactly(
+    points: Points, lens: Lens, size: Pair, move: Callable[[Tensor, Lens], Tensor]
+) -> Points:
+    """Moves points (..., 2) through one lens of images of (H, W) in float64."""
+    if len(check_lens(lens, size)) != 1:
         raise ValueError(f"points move through one lens, got {len(lens)}")
+    if (shape := tuple(np.shape(points)))[-1:] != (2,):
+        raise ValueError(f"points must have shape (..., 2), got {shape}")
     if not isinstance(points, Tensor):
         places = np.asarray(points)
         exact = torch.from_numpy(places.astype(np.float64))

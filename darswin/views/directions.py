@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import OUTSIDE, as_map
+from darswin.lens.pixels import as_map
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
 from darswin.utils.angles import check_turn, degrees_hint
@@ -23,8 +23,10 @@ AXIS = (0.0, 0.0, 1.0)
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
 _STEPS = 361  # points at which the end of what a lens sees is looked for
 _BISECTIONS = 12
+_LEAST_STEP = 1e-9  # of a view whose middle the picture does not show
 _APART = 1.5  # pixels of the image between points at which it is read
-_MOST_READS = 4
+_USUAL_READS = 4  # at most, unless `reads` says more
+MOST_READS = 16  # that a plan of `darswin.frames` can hold
 
 
 class RayView(PixelView):
@@ -47,8 +49,9 @@ class RayView(PixelView):
             it from the roll and pitch of a camera, or from its extrinsics.
         direction: (x, y, z), the middle of the view in the camera's frame, of any length. None
             means the optical axis.
-        reads: the points along each side of a pixel at which the image is read. None means as many
-            as the sizes of the image and of the view suggest, for a picture that is 180° across.
+        reads: the points along each side of a pixel at which the image is read, 1 to 16. None means
+            as many as the sizes of the image and of the view suggest, for a picture that is 180°
+            across.
         mean, std: the arguments of `View`.
 
     Raises:
@@ -79,8 +82,8 @@ class RayView(PixelView):
             if angle is not None and not 0 < angle <= most:
                 hint = degrees_hint(angle)
                 raise ValueError(f"{name} must be in (0, {most:.4g}] rad, got {angle}{hint}")
-        if reads is not None and (as_int(reads) or 0) < 1:
-            raise ValueError(f"reads must be an int of at least 1, got {reads!r}")
+        if reads is not None and not 1 <= (as_int(reads) or 0) <= MOST_READS:
+            raise ValueError(f"reads must be an int from 1 to {MOST_READS}, got {reads!r}")
         self.fov, self.theta_max, self.reads = fov, theta_max, reads
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
@@ -110,17 +113,19 @@ class RayView(PixelView):
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → unit vectors (N or 1, ..., 3) in the camera's
-        frame; NaN where the view ends. size: (H, W) of the images of N lenses."""
+        frame; NaN where the view shows nothing. size: (H, W) of the images of N lenses."""
         step, middle = self._layout(lens, size)
         dim = points.dim()
         flat = (points - self._center(points)) * _row(step, dim) + _row(middle, dim)
-        return self.from_plane(flat) @ self._turn(points).T
+        rays = self.from_plane(flat) @ self._turn(points).T
+        return torch.where(self._shows(rays)[..., None], rays, torch.nan)
 
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
-        of its size: the inverse of `to_rays`. NaN where the view shows nothing."""
+        of its size: the inverse of `to_rays`. NaN where the view shows nothing, and for rays 0."""
+        given = (rays != 0).any(-1)
         rays = F.normalize(rays, dim=-1)
-        return self._points(rays, self._shows(rays), lens, size)
+        return self._points(rays, given & self._shows(rays), lens, size)
 
     def _points(self, rays: Tensor, shown: Tensor, lens: Lens, size: Pair) -> Tensor:
         """`to_points` of unit vectors; NaN unless they are shown."""
@@ -132,7 +137,7 @@ class RayView(PixelView):
         return torch.where(shown[..., None], points, torch.nan)
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
-        return check_sees(self.read_points(lens, size), self, lens)
+        return check_sees(self.read_points(lens, size), self, lens, size)
 
     def read_points(self, lens: Lens, size: Pair) -> Tensor:
         """`image_points` of a view that may see nothing of the lens: for each pixel, the points at
@@ -184,7 +189,7 @@ class RayView(PixelView):
         if self.reads is not None:
             return self.reads
         shrinks = min(size) / min(self.size) * min(1.0, (self.fov or math.pi) / math.pi)
-        return min(max(math.ceil(shrinks / _APART), 1), _MOST_READS)
+        return min(max(math.ceil(shrinks / _APART), 1), _USUAL_READS)
 
     def _center(self, like: Tensor) -> Tensor:
         return tensor_there([(side - 1) / 2 for side in self.size[::-1]], like)
@@ -219,6 +224,7 @@ class RayView(PixelView):
         step = (right - left) / self.size[1]
         if not self.upright:
             step = torch.maximum(step, (lower - upper) / self.size[0])
+        step = step.clamp(min=_LEAST_STEP)
         half = step * (self.size[0] / 2)
         first, last = upper + half, lower - half  # of the middles that show nothing unseen
         wanted = (horizon if self.around else start)[:, 1]
@@ -278,10 +284,12 @@ class RayView(PixelView):
         return ", ".join([super().extra_repr(), *given])
 
 
-def check_sees(points: Tensor, view: PixelView, lens: Lens) -> Tensor:
-    """The points at which a view reads images; ValueError if no lens reaches any of them."""
-    if readable(points) and points.numel() and not (points > OUTSIDE).any():
-        raise ValueError(f"this view sees nothing of the lens: {view} of {lens}")
+def check_sees(points: Tensor, view: PixelView, lens: Lens, size: Pair) -> Tensor:
+    """The points at which a view reads images of (H, W); ValueError if none is in any of them."""
+    if readable(points) and points.numel():
+        inside = (points > -1) & (points < tensor_there(size[::-1], points))
+        if not inside.all(-1).any():
+            raise ValueError(f"this view sees nothing of the lens: {view} of {lens}")
     return points
 
 
@@ -293,10 +301,13 @@ def pixel_grid(size: Pair, like: Tensor) -> Tensor:
 
 def unit_vector(name: str, vector: Vector) -> tuple[float, float, float]:
     """The unit vector of three finite numbers that are not all 0; ValueError otherwise."""
-    values = [float(x) for x in (vector.tolist() if hasattr(vector, "tolist") else vector)]
+    try:
+        values = [float(x) for x in (vector.tolist() if hasattr(vector, "tolist") else vector)]
+    except (TypeError, ValueError):
+        values = []
     length = math.hypot(*values)
     if len(values) != 3 or not 0 < length < math.inf:
-        raise ValueError(f"{name} must be three finite numbers that are not all 0, got {vector}")
+        raise ValueError(f"{name} must be three finite numbers that are not all 0, got {vector!r}")
     x, y, z = (value / length for value in values)
     return x, y, z
 
@@ -331,15 +342,18 @@ def up_of(
 
     Args:
         roll: the angle by which the camera is turned clockwise about its optical axis, as seen from
-            behind it, rad.
-        pitch: the angle by which the optical axis is raised above the horizon, rad.
+            behind it, in [-2π, 2π] rad.
+        pitch: the angle by which the optical axis is raised above the horizon, in [-2π, 2π] rad.
         extrinsics: in place of roll and pitch, the rotation (3, 3) or pose (3 or 4, 4) that takes
             vectors of the camera to the world's or the vehicle's frame.
         world_up: the direction away from gravity in that frame.
 
     Raises:
-        ValueError: roll and pitch are given with extrinsics, or these hold no rotation.
+        ValueError: an angle is out of range, roll and pitch are given with extrinsics, or these
+            hold no rotation.
     """
+    check_turn("roll", roll)
+    check_turn("pitch", pitch)
     if extrinsics is None:
         level = math.cos(pitch)
         return unit_vector(
@@ -350,7 +364,8 @@ def up_of(
     pose = torch.as_tensor(extrinsics, dtype=torch.float64)
     shape = tuple(pose.shape)
     rotation = pose[:3, :3] if shape in ((3, 3), (3, 4), (4, 4)) else pose.new_zeros(3, 3)
-    if not torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4):
+    turns = torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4)
+    if not (turns and torch.linalg.det(rotation) > 0):
         raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
     up = rotation.T @ torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
     return unit_vector("up", up)

@@ -9,6 +9,7 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, sample_at
 from darswin.lens.solve import direction_of, vector_of
+from darswin.ops.checks import as_int
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import (
     Pair,
@@ -88,15 +89,23 @@ class TilesView(PixelView):
         if not 0 < fov <= 2 * math.pi:
             raise ValueError(f"fov must be in (0, 2π] rad, got {fov}{degrees_hint(fov)}")
         if directions is None:
-            if count not in _LAYOUTS:
+            if as_int(count) not in _LAYOUTS:
                 raise ValueError(
                     f"count must be from {min(_LAYOUTS)} to {max(_LAYOUTS)}, got {count}"
                 )
             share = min(1.0, fov / _WHOLE)
             directions = _directions(count, share, up, direction)
-            tile_fov = tile_fov or math.radians(_LAYOUTS[count][3]) * share
-        elif tile_fov is None:
-            raise ValueError("tile_fov must be given with directions")
+            if tile_fov is None:
+                tile_fov = math.radians(_LAYOUTS[count][3]) * share
+        elif tile_fov is None or not len(directions):
+            raise ValueError("directions must be one or more, and be given with tile_fov")
+        elif (count, fov) != (5, _WHOLE) or direction is not None:
+            raise ValueError("directions stand in for count, fov and direction: leave these out")
+        if not 0 < tile_fov <= StereographicView.widest:
+            hint = degrees_hint(tile_fov)
+            raise ValueError(
+                f"tile_fov must be in (0, {StereographicView.widest:.4g}] rad, got {tile_fov}{hint}"
+            )
         self.tiles = [
             StereographicView(
                 size, tile_fov, theta_max, up=up, direction=middle, reads=reads, mean=mean, std=std
@@ -108,7 +117,7 @@ class TilesView(PixelView):
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
         """The points of the tiles below each other, (N, n·H', W', 2) px."""
         points = torch.cat([tile.read_points(lens, size) for tile in self.tiles], 1)
-        return check_sees(points, self, lens)
+        return check_sees(points, self, lens, size)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
         """The points of the tiles below each other that the pixels of the images show."""

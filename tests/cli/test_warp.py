@@ -276,8 +276,40 @@ def test_a_second_run_goes_on(flat, tmp_path, capsys):
         flat, tmp_path / "out", FLAT, "--lens", FLAT, "--size", "9,9", capsys=capsys
     ) == (
         f"darswin: --out {tmp_path / 'out'} holds other files: give a new or an empty folder, or "
-        "one of an earlier run of the same command, which then goes on"
+        "one of an earlier run of the same command with the same calibrations, which then goes on"
     )
+
+
+@pytest.mark.parametrize("given", ["a lens.json beside the labels", "a file", "a table"])
+def test_pictures_of_another_calibration_are_not_kept(flat, tmp_path, capsys, given):
+    source = edited(flat, tmp_path, lambda content: None)
+    calibration, options = tmp_path / "lens.json", ()
+    calibration.write_text(FLAT)
+    if given == "a file":
+        calibration = calibration.rename(tmp_path / "other.json")
+        options = ("--lens", calibration)
+    if given == "a table":
+        (tmp_path / "lenses.json").write_text(json.dumps({".": "lens.json"}))
+        options = ("--lens", tmp_path / "lenses.json")
+    arguments = source, tmp_path / "out", "mercator", *options, "--size", "32,32"
+    warp(*arguments)
+    warp(*arguments)
+    calibration.write_text(FLAT.replace("70", "90"))
+    assert "with the same calibrations" in refused(*arguments, capsys=capsys)
+
+
+@pytest.mark.parametrize("place", ["../images", "{folder}/images"])
+@pytest.mark.parametrize("to", [WIDE, "tiles:4"])
+def test_no_picture_is_written_or_kept_outside_of_the_new_folder(flat, tmp_path, capsys, place, to):
+    def move(content):
+        for entry in content["images"]:
+            entry["file_name"] = f"{place.format(folder=flat.parent)}/{entry['file_name']}"
+
+    before = sorted(flat.parent.rglob("*"))
+    source = edited(flat, tmp_path, move)
+    text = refused(source, tmp_path / "out", to, "--lens", FLAT, capsys=capsys)
+    assert "names pictures outside of the folder" in text and "0.png: name them relative" in text
+    assert not (tmp_path / "out").exists() and sorted(flat.parent.rglob("*")) == before
 
 
 @pytest.mark.slow
@@ -347,7 +379,23 @@ def edited(flat, folder, edit):
         (WIDE, ("--lens", FLAT, "--processes", "0"), "--processes must be at least 1, got 0"),
         (WIDE, ("--lens", FLAT, "--size", "0,5"), "--size must be at least 1,1"),
         ("mercator", ("--lens", FLAT, "--fov_deg", "400"), "--fov_deg must be above 0°"),
-        ("mercator", ("--lens", FLAT, "--up", "0,0,0"), "up must"),
+        (
+            "stereographic",
+            ("--lens", FLAT, "--fov_deg", "350"),
+            "--fov_deg .* at most 340° for a s",
+        ),
+        (
+            "perspective",
+            ("--lens", FLAT, "--fov_deg", "180"),
+            "--fov_deg .* at most 179.9° for a p",
+        ),
+        ("mercator", ("--lens", FLAT, "--up", "0,0,0"), "--up must be three finite numbers"),
+        ("mercator", ("--lens", FLAT, "--up", "0,1"), "--up must be three finite numbers"),
+        (
+            "tiles:",
+            ("--lens", FLAT),
+            "--to must be NAME or NAME:COUNT, such as tiles:5, got tiles:",
+        ),
     ],
 )
 def test_wrong_options(flat, tmp_path, capsys, to, options, said):
@@ -363,6 +411,9 @@ def test_wrong_options(flat, tmp_path, capsys, to, options, said):
         (lambda c: c["annotations"][0].update(image_id=9), "is of the picture 9, which"),
         (lambda c: c["images"][0].update(file_name="no.png"), "1 of 3 pictures of .* are not in"),
         (lambda c: c.pop("categories"), "must have the lists"),
+        (lambda c: c["categories"][0].pop("name"), "a category must have a name, got {'id': 1}"),
+        (lambda c: c["categories"][0].update(keypoints=[1]), "is not in COCO's form: 'int' obj"),
+        (lambda c: c["images"][0].update(file_name=5), "is not in COCO's form: expected str"),
     ],
 )
 def test_wrong_sets(flat, tmp_path, capsys, edit, said):

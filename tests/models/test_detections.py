@@ -195,8 +195,14 @@ def test_no_boxes_and_boxes_that_the_lens_does_not_see(name):
 def test_detections_that_do_not_fit_are_refused():
     lens, images = LENSES["radial"], torch.zeros(1, 3, *SIZE)
     network = _Constant(torch.zeros(1, 4))
-    with pytest.raises(ValueError, match="for all 5 tiles of each image, got 1 results"):
+    with pytest.raises(ValueError, match="for each of its 5 pictures, got 1 results"):
         LensAdapter(network, 64, view="tiles")(images, lens)
+    for view in ("mercator", "none"):
+        with pytest.raises(ValueError, match="for each of its 2 pictures, got 1 results"):
+            LensAdapter(network, 64, view=view)(images.expand(2, -1, -1, -1), lens)
+    for wrong in (network.found_dict()["boxes"], {"boxes": np.zeros((1, 4))}, [1, 2]):
+        with pytest.raises(TypeError, match="boxes must return a dict of tensors boxes, scores"):
+            LensAdapter(network, 64, view="tiles", boxes=lambda _, w=wrong: w)(images, lens)
     masks = dict(network.found_dict(), masks=torch.zeros(1, 1, 64, 64))
     with pytest.raises(ValueError, match="masks of tiles cannot come back"):
         LensAdapter(network, 64, view="tiles", boxes=lambda _: [masks] * 5)(images, lens)

@@ -38,3 +38,9 @@ def test_a_table_of_one_entry_or_one_row_is_constant_across():
     np.testing.assert_allclose(read_table(one, np.array([[0.2, -0.3]])), 3)
     table = np.arange(4.0).reshape(1, 4, 1)
     np.testing.assert_allclose(read_table(table, np.array([[1.5, 0.4]])), [[1.5]])
+
+
+@pytest.mark.parametrize("shape", [(3,), (5, 1), ()])
+def test_points_have_two_coordinates(shape):
+    with pytest.raises(ValueError, match=r"points must have shape \(..., 2\), got"):
+        read_table(np.ones((4, 5, 2)), np.zeros(shape))

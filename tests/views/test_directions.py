@@ -298,10 +298,20 @@ def test_own_directions():
         ("mercator", dict(up=(0, 0, 0)), "up must be three finite numbers that are not all 0"),
         ("mercator", dict(up=(0, math.nan, 1)), "up must be three finite"),
         ("mercator", dict(direction=(1, 2)), "direction must be three finite"),
-        ("mercator", dict(reads=0), "reads must be an int of at least 1, got 0"),
+        ("mercator", dict(up=5), "up must be three finite numbers that are not all 0, got 5"),
+        ("mercator", dict(up="abc"), "up must be three finite"),
+        ("mercator", dict(up=torch.zeros(2, 3)), "up must be three finite"),
+        ("mercator", dict(reads=0), "reads must be an int from 1 to 16, got 0"),
+        ("mercator", dict(reads=17), "reads must be an int from 1 to 16, got 17"),
         ("tiles", dict(count=3), "count must be from 4 to 9, got 3"),
         ("tiles", dict(fov=-1.0), "fov must be in"),
-        ("tiles", dict(directions=[(0, 0, 1)]), "tile_fov must be given"),
+        ("tiles", dict(count=5.0), "count must be from 4 to 9, got 5.0"),
+        ("tiles", dict(tile_fov=0.0), r"tile_fov must be in \(0, 5.934\] rad, got 0.0"),
+        ("tiles", dict(tile_fov=85), r"tile_fov must be in .* 85° is 1\.484"),
+        ("tiles", dict(directions=[(0, 0, 1)]), "be given with tile_fov"),
+        ("tiles", dict(directions=[], tile_fov=1.0), "directions must be one or more"),
+        ("tiles", dict(directions=[(0, 0, 1)], tile_fov=1.0, direction=(1, 0, 0)), "leave these"),
+        ("tiles", dict(directions=[(0, 0, 1)], tile_fov=1.0, count=7), "leave these out"),
     ],
 )
 def test_wrong_options_are_explained(name, options, message):
@@ -337,3 +347,70 @@ def test_a_view_for_one_lens_is_the_same_view(name):
         found = known.to_view(points, one, (120, 160)), view.to_view(points, one, (120, 160))
         same = torch.equal(*(points.nan_to_num(-1) for points in found))
         assert same == (one is lens or name == "panorama")  # which is as wide for all
+
+
+@pytest.mark.parametrize("name", OF_PIXELS)
+def test_sizes_of_views_are_pairs(name):
+    side = 16
+    for size in ([side, side], (np.int64(side), side)):
+        assert make_view(name, size).size == (side, side)
+    for wrong in (side, (16.0, 16.0), (16,), "16"):
+        with pytest.raises(TypeError, match="size must be a pair of ints, got"):
+            make_view(name, wrong)
+    for wrong in ((0, 0), (-4, -4)):
+        with pytest.raises(ValueError, match="size must be at least 1"):
+            make_view(name, wrong)
+
+
+@pytest.mark.parametrize("name", OF_PIXELS)
+def test_points_of_another_size_and_shape_are_refused(name):
+    view, lens = make_view(name, (16, 16)), WIDE.replace(image_size=torch.tensor([SIZE]))
+    for move in (view.to_image, view.to_view):
+        with pytest.raises(ValueError, match=r"images of \(H, W\) = \(480, 640\)"):
+            move([[1.0, 2.0]], lens, (240, 320))
+        with pytest.raises(ValueError, match=r"points must have shape \(..., 2\), got \(3,\)"):
+            move([1.0, 2.0, 3.0], lens, SIZE)
+
+
+@pytest.mark.parametrize("name", RAY_VIEWS)
+def test_pixels_and_rays_that_show_nothing_go_nowhere(name):
+    view = make_view(name, (64, 64), fov=2.0, theta_max=0.5)
+    y, x = np.indices(view.size, float)
+    shown = view.rays(WIDE, SIZE)[0].any(-1).numpy()
+    places = view.to_image(np.stack((x, y), -1), WIDE, SIZE)
+    assert 0 < shown.mean() < 1
+    assert (np.isfinite(places).all(-1) == shown).all()
+    nowhere = torch.tensor([[[0.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]])
+    assert make_view(name, (64, 64)).to_points(nowhere, WIDE, SIZE).isnan().all()
+
+
+@pytest.mark.parametrize("name", RAY_VIEWS)
+def test_a_lens_whose_axis_is_outside_of_the_picture(name):
+    beside = WIDE.replace(center=torch.tensor([[320.0, -60.0]]))
+    images, view = torch.ones(2, 1, *SIZE), make_view(name, (32, 96))
+    if not view.around:
+        with pytest.raises(ValueError, match="sees nothing of the lens"):
+            view(images[:1], beside)
+    lenses = torch.cat((WIDE.center_in(), beside.center_in()))
+    prepared = view.prepare(WIDE[[0, 0]].replace(center=lenses), SIZE)
+    back = view.back(torch.ones(2, 1, 32, 96), prepared)
+    assert back.isfinite().all() and prepared.rays.isfinite().all()
+    assert (
+        back[0].max() > 0.99
+        and make_view(name, (32, 96), direction=(0, 1, 1))(images, beside).any()
+    )
+
+
+def test_images_of_ints_are_refused():
+    for name in OF_PIXELS:
+        with pytest.raises(TypeError, match="images must be uint8 or in floating point, got"):
+            make_view(name, (16, 16))(torch.zeros(1, 3, *SIZE, dtype=torch.int32), WIDE)
+
+
+def test_degrees_and_reflections_are_no_up():
+    with pytest.raises(ValueError, match=r"pitch must be in .* -35° is -0\.6109"):
+        up_of(pitch=-35.0)
+    with pytest.raises(ValueError, match=r"roll must be in .* 35° is 0\.6109"):
+        up_of(roll=35.0)
+    with pytest.raises(ValueError, match="extrinsics must be a rotation"):
+        up_of(extrinsics=np.diag([1.0, 1.0, -1.0]))

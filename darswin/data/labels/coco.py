@@ -9,6 +9,7 @@ Source: cocodataset.org/#format-data.
 
 import json
 import math
+import os
 import reprlib
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -49,11 +50,13 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         raise ValueError(f'{path} must have the lists "images", "annotations" and "categories"')
     try:
         entries, categories = content["images"], content["categories"]
-        files = [entry["file_name"] for entry in entries]
+        files = [os.fspath(entry["file_name"]) for entry in entries]
         of_picture: dict[Any, list[dict]] = {entry["id"]: [] for entry in entries}
         mirrors = {
-            category["id"]: _mirror(category.get("keypoints", ())) for category in categories
+            category["id"]: _mirror(category.get("keypoints") or ()) for category in categories
         }
+        if nameless := [category for category in categories if "name" not in category]:
+            raise ValueError(f"{path}: a category must have a name, got {nameless[0]}")
         for annotation in content["annotations"]:
             if (category := annotation["category_id"]) not in mirrors:
                 raise ValueError(
@@ -66,8 +69,10 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
                     "which the file does not list"
                 )
             of_picture[picture].append(annotation)
-    except (KeyError, TypeError) as error:
+    except KeyError as error:
         raise ValueError(f"{path} is not in COCO's form: it lacks {error}") from error
+    except (AttributeError, TypeError) as error:
+        raise ValueError(f"{path} is not in COCO's form: {error}") from error
     if len(of_picture) < len(entries) or len(set(files)) < len(files):
         raise ValueError(f"{path} lists a picture twice")
     folder = Path(pictures) if pictures is not None else _folder(path, files)
@@ -162,46 +167,59 @@ def _labels(
             f"{path} says that {entry['file_name']} has {said[1]} × {said[0]} px, but it has "
             f"{size[1]} × {size[0]}"
         )
-    return Labels([_thing(one, path, mirrors, size) for one in annotations], size)
-
-
-def _thing(annotation: Mapping[str, Any], path: str, mirrors: Mapping, size: Size) -> Thing:
-    def numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+    things = []
+    for annotation in annotations:
         try:
-            table = np.asarray(values, float).reshape(-1, group)
-        except (TypeError, ValueError):
-            table = np.full((1, group), math.nan)
-        if len(table) < least or not np.isfinite(table).all():
-            raise ValueError(
-                f"{path}: the annotation {annotation.get('id')} has the {name} "
-                f"{reprlib.repr(values)}, which must be finite numbers, {group} each"
-            )
-        return table
+            things.append(_thing(annotation, mirrors, size))
+        except ValueError as error:
+            raise ValueError(f"{path}: the annotation {annotation.get('id')} {error}") from error
+    return Labels(things, size)
 
-    segments = annotation.get("segmentation") or ()
-    rle = segments if isinstance(segments, Mapping) else None
-    if rle is not None and tuple(rle.get("size", ())) != size:
+
+def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+    try:
+        table = np.asarray(values, float).reshape(-1, group)
+    except (TypeError, ValueError):
+        table = np.full((1, group), math.nan)
+    if len(table) < least or not np.isfinite(table).all():
         raise ValueError(
-            f"{path}: the annotation {annotation.get('id')} has a mask of {rle.get('size')} px in "
-            f"a picture of {list(size)}"
+            f"has the {name} {reprlib.repr(values)}, which must be finite numbers, {group} each"
         )
-    polygons = [] if rle is not None else [numbers("polygon", one, 2) for one in segments]
+    return table
+
+
+def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing:
+    segments = annotation.get("segmentation") or ()
+    polygons, rle, mask = [], None, np.zeros(size, bool)
+    if isinstance(segments, Mapping):
+        rle = segments
+        try:
+            mask = decode_rle(rle)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"has a mask that cannot be read: {error}") from error
+        if mask.shape != size:
+            raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")
+    else:
+        parts = segments if isinstance(segments, Sequence) else [segments]
+        polygons = [_numbers("polygon", one, 2) for one in parts]
     if "bbox" in annotation:
-        x, y, width, height = numbers("box", annotation["bbox"], 4)[0]
+        x, y, width, height = _numbers("box", annotation["bbox"], 4)[0]
         box = np.array([x, y, x + width, y + height])
     elif rle is not None:
-        box = box_of_mask(decode_rle(rle))
+        box = box_of_mask(mask)
     elif polygons:
         corners = np.concatenate(polygons)
         box = np.concatenate((corners.min(0), corners.max(0)))
     else:
-        raise ValueError(f"{path}: the annotation {annotation.get('id')} has no bbox")
+        raise ValueError("has no bbox")
     keypoints = annotation.get("keypoints")
+    visible = annotation.get("visible", 1.0)
+    if not (isinstance(visible, int | float) and 0 <= visible <= 1):
+        raise ValueError(f"has visible {visible!r}, which must be a share from 0 to 1")
     return Thing(
         annotation["category_id"], box, polygons, rle,
-        None if keypoints is None else numbers("keypoints", keypoints, 3, 0),
-        mirrors[annotation["category_id"]], bool(annotation.get("iscrowd", 0)),
-        annotation.get("visible", 1.0),
+        None if keypoints is None else _numbers("keypoints", keypoints, 3, 0),
+        mirrors[annotation["category_id"]], bool(annotation.get("iscrowd", 0)), visible,
         {name: value for name, value in annotation.items() if name not in _OWN},
     )  # fmt: skip
 

@@ -1,6 +1,7 @@
 """COCO, YOLO and WoodScape: files read, written and read again, and wrong files."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -122,6 +123,27 @@ def test_the_share_that_is_visible_is_kept(tmp_path):
     assert data.labels(0).things[0].visible == 0.625
     write_coco(tmp_path / "again.json", [(IMAGES[0], data.labels(0))], CATEGORIES)
     assert json.loads((tmp_path / "again.json").read_text())["annotations"][0]["visible"] == 0.625
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (dict(segmentation={"size": list(SIZE)}), "has a mask that cannot be read: 'counts'"),
+        (dict(segmentation={"size": None, "counts": [1]}), "has a mask that cannot be read"),
+        (
+            dict(segmentation={"size": list(SIZE), "counts": "zzz"}),
+            "has a mask that cannot be read",
+        ),
+        (dict(segmentation=5), "has the polygon 5, which must be finite"),
+        (dict(visible=None), "has visible None, which must be a share from 0 to 1"),
+        (dict(visible="yes"), "has visible 'yes'"),
+        (dict(visible=55), "has visible 55"),
+    ],
+)
+def test_wrong_annotations_are_named(tmp_path, changes, said):
+    file = write(tmp_path, **changed(0, **changes))
+    with pytest.raises(ValueError, match=re.escape(f"{file}: the annotation 5 {said}")):
+        read_coco(file).labels(0)
 
 
 def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
