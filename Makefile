@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -121,6 +121,10 @@ study-dense: build  ## study labels and distances through unknown lenses (5 hour
 
 study-sizes: build  ## study distances that only the lens and the size of balls reveal (half an hour; can be interrupted)
 	$(BIN)/python studies/sizes.py
+
+study-pretrained: build  ## study detectors for ordinary photographs on fisheye pictures (half an hour; needs npm and apt-get)
+	$(BIN)/python studies/pretrained_files.py
+	$(BIN)/python studies/pretrained.py
 
 tables: $(STAMP)  ## fill the tables of README and docs with the results of bench and study
 	$(BIN)/python docs/fill.py

@@ -124,6 +124,7 @@ def tables() -> dict[str, str]:
     import dense_tables
     import learned_tables
     import peers
+    import pretrained_tables
     import sizes_tables
     import tables as study
 
@@ -144,6 +145,7 @@ def tables() -> dict[str, str]:
     dense = json.loads((studies / "dense.json").read_text())
     tried = json.loads((studies / "trials.json").read_text())["rows"]
     sizes = json.loads((studies / "sizes.json").read_text())
+    pretrained = json.loads((studies / "pretrained.json").read_text())
     return {
         "demo": demo_table(demo),
         "demo line": demo_line(demo),
@@ -170,6 +172,7 @@ def tables() -> dict[str, str]:
         **dense_tables.tables(dense, studies),
         **{f"trials {of}": dense_tables.trials(tried, of) for of in dense_tables.TRIED},
         **sizes_tables.tables(sizes),
+        **pretrained_tables.tables(pretrained),
     }
 
 

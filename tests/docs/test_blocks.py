@@ -41,7 +41,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 ALONE = ("README.md", "answers.md")  # each of their blocks runs without the ones before it
 FENCE = re.compile(r"^(`{3,}|:{3,})(\S*)[^\n]*\n(.*?)^\1$", re.M | re.S)
 DIRECTIVES = {"{toctree}", "{eval-rst}", "{include}", "{warning}"}  # Sphinx builds these
-SHOWN = {"bibtex"}
 QUICK = [
     *("--data.limit", "40", "--data.batch_size", "8", "--data.workers", "0"),
     *("--trainer.max_epochs", "1", "--trainer.logger", "false"),
@@ -70,12 +69,9 @@ def test_every_block_is_of_a_kind_that_is_checked():
     for page in PAGES:
         text, found = page.read_text(), blocks(page)
         for block in found:
-            assert block.language in {"python", "sh", "json"} | DIRECTIVES | SHOWN, (page, block)
+            assert block.language in {"python", "sh", "json"} | DIRECTIVES, (page, block)
         assert len(re.findall(r"^(?:```|:::)", text, re.M)) == 2 * len(found), page
     assert len(CODE) > 12
-    assert [page_name(p) for p in PAGES if any(b.language in SHOWN for b in blocks(p))] == [
-        "README.md"
-    ]
 
 
 @pytest.mark.parametrize("page, block", JSON, ids=[page_name(page) for page, _ in JSON])

@@ -258,6 +258,68 @@ def test_the_sizes_study_shows_its_point():
     assert score(fixed, "100°") - score(polar, "100°") > 30
 
 
+def test_the_study_of_pretrained_detectors_shows_its_point():
+    record = json.loads((ROOT / "studies/results/pretrained.json").read_text())
+    tables = {name: of["methods"] for name, of in record["tables"].items()}
+    level, down = tables["CenterNet, level"], tables["CenterNet, down"]
+
+    def score(name: str, of: dict = level, key: str = "map") -> str:
+        return f"{of[name][key]:.2f}".removeprefix("0")
+
+    page = (ROOT / "docs/study_pretrained.md").read_text()
+    results = " ".join(page.split("## Results")[1].split("### One run")[0].split())
+    flat, square = "rectified, 120°", "concentric square"
+    for sentence in (
+        f"a Mercator map finds {score('mercator')} mAP, the picture itself {score('raw')}.",
+        f"stretched ({score('equirectangular')}), stereographic ones lean "
+        f"({score('stereographic')})",
+        f"does both ({score(square)}, less than raw). A cylinder has {score('cylindrical')}.",
+        f"the picture itself has {score('raw, 1024²')} and a Mercator map "
+        f"{score('mercator, 1024²')}.",
+        f"Five tiles have {score('tiles: 5')} mAP. Their recall is "
+        f"{score('tiles: 5', key='recall')}, against {score('mercator, 1024²', key='recall')}",
+        f"4 tiles and a Mercator map, {score('tiles: 4, and mercator')}:",
+        f"ten runs, have {score('tiles: 9, and mercator')}.",
+        f"five find {100 * level['tiles: 5']['of_flat']:.0f} %",
+        f"five tiles find {100 * level['tiles: 5']['same_as_flat']:.0f} % and nine "
+        f"{100 * level['tiles: 9']['same_as_flat']:.0f} %",
+        f"Rectified to 120°, the picture has {score(flat)} mAP",
+        f"Rectified to 160°, it has {score('rectified, 160°')}.",
+        f"without a view: {score('raw', down)}. A panorama about gravity has "
+        f"{score('panorama', down)}",
+        f"have {score('ring of 6 tiles', down)}, and the same tiles level with the picture only "
+        f"{score('ring of 6 tiles, level with the picture', down)}.",
+    ):
+        assert sentence in results, sentence
+    readme = " ".join(README.split())
+    assert f"has [{score('raw')} mAP](docs/study_pretrained.md) on the picture itself" in readme
+    assert f"{score('mercator')} on one Mercator view of as many pixels" in readme
+    assert f"and {score('tiles: 5')} on five tiles." in readme
+    page = (ROOT / "docs/explanation/views.md").read_text()
+    large = {view: score(f"{view}, 1024²") for view in ("raw", "stereographic", "mercator")}
+    assert score("stereographic") == score("cylindrical")
+    assert score("equirectangular, 1024²") == large["stereographic"]
+    for row in (
+        f'| the picture, `"none"` | {score("raw")} | {large["raw"]} |',
+        f'| `"perspective"` of 120° | {score(flat)} | |',
+        f'| `"square"` | {score(square)} | |',
+        f'| `"stereographic"`, `"cylindrical"` | {score("cylindrical")} | '
+        f"{large['stereographic']} (stereographic) |",
+        f'| `"equirectangular"` | {score("equirectangular")} | {large["stereographic"]} |',
+        f'| `"mercator"` | {score("mercator")} | {large["mercator"]} |',
+        f'| `"tiles"`, 5 / 9 | {score("tiles: 5")} / {score("tiles: 9")} | |',
+        f"({score('ring of 6 tiles', down)} against {score('tiles: 5', down)} mAP in",
+    ):
+        assert row in page, row
+    assert level["tiles: 6"]["of_flat"] >= 1
+    for tiles in ("tiles: 4 of 256²", "tiles: 5 of 224²"):
+        assert level[tiles]["map"] < level["raw"]["map"]
+    assert level["tiles: 5"]["map"] - level["tiles: 5, wrong lens"]["map"] > 0.2
+    second = tables["NanoDet, level"]
+    assert second[square]["map"] < second["raw"]["map"] < second["mercator"]["map"]
+    assert second["mercator"]["map"] < second["tiles: 5"]["map"]
+
+
 def test_the_demo_shows_its_point():
     accuracy = json.loads((ROOT / "docs/accuracy.json").read_text())["accuracy"]
     assert min(min(run) for run in accuracy["DarSwin-A"]) >= 92

@@ -28,6 +28,7 @@ import fill  # noqa: E402
 import learned_tables  # noqa: E402
 import lens  # noqa: E402
 import levels  # noqa: E402
+import pretrained_tables  # noqa: E402
 import sizes_tables  # noqa: E402
 import tables  # noqa: E402
 import views  # noqa: E402
@@ -70,6 +71,12 @@ def draw_dense_pictures(path: Path) -> None:
     dense_pictures.draw_columns({n: [PICTURE] * 6 for n in dense_pictures.SHOWN}, rows, path)
 
 
+def draw_detections(path: Path) -> None:
+    one = np.ones(1)
+    found = pretrained_tables.Found(np.array([[300.0, 300, 700, 700]]), one, np.array([0]), one)
+    pretrained_tables.draw_found([(PICTURE, [found] * 3)] * 2, path)
+
+
 RETURNED: dict[str, Callable[[], Figure]] = {
     "demo": draw_demo,
     "labels": lambda: draw_predictions(
@@ -87,6 +94,10 @@ WRITTEN: dict[str, Callable[[Path], None]] = {
     "learned lens": lambda path: learned_tables.draw(
         record("studies/results/learned_lens.json")["cameras"], path
     ),
+    "pretrained": lambda path: pretrained_tables.draw_scores(
+        record("studies/results/pretrained.json")["tables"]["CenterNet, level"]["methods"], path
+    ),
+    "pretrained found": draw_detections,
     "sizes": lambda path: sizes_tables.draw_scores(
         record("studies/results/sizes.json")["cells"], path
     ),
@@ -98,7 +109,9 @@ WRITTEN: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("name", [*RETURNED, *WRITTEN])
 def test_the_text_of_a_figure_is_large_enough(name, monkeypatch, tmp_path):
     figures = []
-    for module in (dense_pictures, dense_tables, learned_tables, sizes_tables, tables):
+    for module in (
+        dense_pictures, dense_tables, learned_tables, pretrained_tables, sizes_tables, tables,
+    ):  # fmt: skip
         monkeypatch.setattr(module, "save_figure", lambda figure, *_, **__: figures.append(figure))
     if name in RETURNED:
         figures.append(RETURNED[name]())

@@ -68,7 +68,11 @@ def is_whole(mask):
     return mask.sum() > 300 and mask[1:-1, 1:-1].sum() == mask.sum()
 
 
-@pytest.mark.parametrize("name", OF_PIXELS)
+@pytest.mark.parametrize(
+    "name",
+    [n if n in ("mercator", "tiles") else pytest.param(n, marks=pytest.mark.slow)
+     for n in OF_PIXELS],
+)  # fmt: skip
 def test_labels_of_every_form_go_through_every_lens_and_view(name):
     checked, boxes = set(), []
     view_size = {"none": SIZE, "panorama": (150, 420)}.get(name, (180, 180))

