@@ -129,7 +129,7 @@ class Plan:
         """The places of the points, (n, reads·H', reads·W', 2), NaN outside of the frame."""
         if self.output == "tokens":
             raise ValueError("a plan of tokens has no pixels that could be carried to the frame")
-        places = np.stack((self.columns + self.right, self.rows + self.lower), -1, dtype=float)
+        places = np.stack((self.columns + self.right, self.rows + self.lower), -1)
         places[self.columns == _OUTSIDE] = np.nan
         height, width = self.columns.shape[-2 - (self.reads > 1) :][:2]
         places = places.reshape(-1, height, width, self.reads, self.reads, 2)

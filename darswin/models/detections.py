@@ -24,15 +24,24 @@ def find_detections(results: Any) -> list[Mapping[str, Tensor]] | None:
     if isinstance(results, Mapping) and _has_boxes(results):
         if results["boxes"].dim() == 2:
             return [results]
-        parts = zip(*(value for value in results.values()), strict=True)
-        return [dict(zip(results, part, strict=True)) for part in parts]
+        pictures = len(results["boxes"])
+        values = {
+            name: value for name, value in results.items()
+            if isinstance(value, Tensor) and value.dim() > 1 and len(value) == pictures
+        }  # fmt: skip
+        return [{name: value[k] for name, value in values.items()} for k in range(pictures)]
     is_list = isinstance(results, (list, tuple)) and len(results) > 0
     return list(results) if is_list and all(map(_has_boxes, results)) else None
 
 
 def _has_boxes(found: Any) -> bool:
-    names = isinstance(found, Mapping) and set(NAMES) <= set(found)
-    return names and all(isinstance(found[name], Tensor) for name in NAMES)
+    """True for a dict of boxes, scores and labels; TypeError if they are no tensors."""
+    if not (isinstance(found, Mapping) and set(NAMES) <= set(found)):
+        return False
+    for name in NAMES:
+        if not isinstance(found[name], Tensor):
+            raise TypeError(f"{name} of detections must be a tensor, got {type(found[name])}")
+    return True
 
 
 def detections_to_images(
@@ -42,8 +51,8 @@ def detections_to_images(
 
     Args:
         found: for each picture, boxes (K, 4), scores (K,) and labels (K,); and optionally masks
-            (K, 1, H', W') and keypoints (K, P, 3), and other values (K, ...), which stay as they
-            are. The coordinates are torchvision's.
+            (K, 1, H', W') and keypoints (K, P, 3), and other tensors (K, ...), which stay as they
+            are. Values of another length are left out. The coordinates are torchvision's.
 
     Returns:
         For each image, the same dicts. The boxes are cut at the borders of the image, and those of
@@ -53,14 +62,9 @@ def detections_to_images(
         are resampled to the image. Keypoints that the image does not show are NaN.
 
     Raises:
-        ValueError: the number of results does not fit, the view is polar, or there are masks of
-            tiles.
+        ValueError: boxes, scores and labels do not fit together, the view is polar, or there are
+            masks of tiles.
     """
-    if len(found) % view.count:
-        raise ValueError(
-            f"the network must give detections for all {view.count} tiles of each image, got "
-            f"{len(found)} results"
-        )
     images = [found[k : k + view.count] for k in range(0, len(found), view.count)]
     if isinstance(prepared.points, PolarGrid):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
@@ -121,21 +125,34 @@ def _carried(
 ) -> dict[str, Tensor]:
     """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image along
     rays (H', W', 3)."""
-    boxes = found["boxes"]
+    boxes, scores = found["boxes"], found["scores"]
+    count = len(boxes)
+    if boxes.shape != (count, 4) or scores.shape != (count,) or found["labels"].shape != (count,):
+        shapes = ", ".join(f"{name} {tuple(found[name].shape)}" for name in NAMES)
+        raise ValueError(f"detections must be boxes (K, 4), scores (K,), labels (K,), got {shapes}")
+    if not boxes.is_floating_point():
+        boxes = boxes.float()
+    kept = {
+        name: value for name, value in found.items()
+        if isinstance(value, Tensor) and value.dim() and len(value) == count
+    }  # fmt: skip
     if points is None:  # the picture is the image
-        return dict(found) | dict(visible=torch.ones_like(found["scores"]))
+        whole = boxes.isfinite().all(1).to(boxes)
+        return kept | dict(boxes=boxes, visible=whole)
     assert rays is not None
-    reads = points.shape[0] // rays.shape[0]
+    height, width = rays.shape[:2]
+    reads = points.shape[0] // height
+    boxes = of_boxes.clip(boxes, (height, width))
 
     def to_image(pixels: np.ndarray) -> np.ndarray:
         return read_table(points, (pixels + 0.5) * reads - 0.5)
 
     carried, visible = of_boxes.carry(boxes, to_image)
     moved = dict(boxes=carried, visible=visible)
-    if "keypoints" in found:
-        places = of_boxes.carry_points(found["keypoints"][..., :2], to_image)
-        moved["keypoints"] = torch.cat((places, found["keypoints"][..., 2:]), -1)
+    if "keypoints" in kept:
+        places = of_boxes.carry_points(kept["keypoints"][..., :2], to_image)
+        moved["keypoints"] = torch.cat((places, kept["keypoints"][..., 2:]), -1)
     middle = boxes.detach().double().cpu().unflatten(1, (2, 2)).mean(1).numpy() - 0.5
-    inside = np.clip(middle, 0, [rays.shape[1] - 1, rays.shape[0] - 1])
+    inside = np.clip(middle, 0, [width - 1, height - 1])
     ray = torch.from_numpy(read_table(rays, inside)).to(boxes)
-    return dict(found) | moved | dict(rays=F.normalize(ray, dim=1))
+    return kept | moved | dict(rays=F.normalize(ray, dim=1))

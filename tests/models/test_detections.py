@@ -211,6 +211,36 @@ def test_detections_that_do_not_fit_are_refused():
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("name", VIEWS)
+def test_odd_boxes_of_networks(name):
+    """Boxes larger than the view, of whole numbers, and values that are not of the boxes."""
+    lens, images = LENSES["radial"], torch.zeros(1, 3, *SIZE)
+    view = make_view(name, SIZE if name == "none" else (64, 64))
+    tiles = view.count
+    height, width = SIZE if name == "none" else (64, 64)
+    large = torch.tensor([[-50, -50, 2 * width, 2 * height]])
+    out = dict(boxes=large, scores=torch.ones(1), labels=torch.zeros(1), loss=torch.tensor(2.0))
+    (found,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: [out] * tiles)(images, lens)
+    assert len(found["boxes"]) >= 1 and "loss" not in found
+    box = found["boxes"][0]
+    assert (box[2:] - box[:2]).min() > (20 if name == "tiles" else 60)
+    batched = {k: v[None].expand(tiles, *v.shape) if v.dim() else v for k, v in out.items()}
+    (same,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: batched)(images, lens)
+    assert torch.equal(same["boxes"], found["boxes"])
+    none = dict(out, boxes=torch.full((1, 4), math.nan))
+    (empty,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: [none] * tiles)(images, lens)
+    assert empty["boxes"].shape == (0, 4)
+    for wrong, kind, message in (
+        (dict(scores=torch.ones(2)), ValueError, r"got boxes \(1, 4\), scores \(2,\)"),
+        (dict(boxes=torch.zeros(1, 5)), ValueError, r"got boxes \(1, 5\)"),
+        (dict(boxes=large.numpy()), TypeError, "boxes of detections must be a tensor"),
+    ):
+        bad = [out | wrong] * tiles
+        with pytest.raises(kind, match=message):
+            LensAdapter(nn.Identity(), view=view, boxes=lambda _, bad=bad: bad)(images, lens)
+
+
+@torch.no_grad()
 def test_prepared_lenses_and_one_for_each_image():
     both = Spherical.from_fov([0.3, 0.9], 2.8, 120.0)
     images = torch.cat([disks(both[k])[0] for k in range(2)])
