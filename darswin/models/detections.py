@@ -143,6 +143,8 @@ def _carried(
     height, width = rays.shape[:2]
     reads = points.shape[0] // height
     boxes = of_boxes.clip(boxes, (height, width))
+    outside = (boxes[:, 2:] <= boxes[:, :2]).any(1, keepdim=True)
+    boxes = torch.where(outside, torch.nan, boxes)
 
     def to_image(pixels: np.ndarray) -> np.ndarray:
         return read_table(points, (pixels + 0.5) * reads - 0.5)

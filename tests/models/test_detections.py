@@ -211,7 +211,7 @@ def test_detections_that_do_not_fit_are_refused():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", sorted(set(VIEWS) - {"panorama"}))  # whose ends no lens sees
 def test_odd_boxes_of_networks(name):
     """Boxes larger than the view, of whole numbers, and values that are not of the boxes."""
     lens, images = LENSES["radial"], torch.zeros(1, 3, *SIZE)
