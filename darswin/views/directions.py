@@ -10,11 +10,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map
+from darswin.lens.pixels import as_map, ray_channels
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
 from darswin.utils.angles import check_turn, degrees_hint
-from darswin.views.base import Pair, PerChannel, PixelView, Prepared
+from darswin.views.base import Pair, PerChannel, PixelView, Prepared, check_lens
 
 Vector = Sequence[float] | Tensor
 
@@ -164,9 +164,7 @@ class RayView(PixelView):
     def rays(self, lens: Lens, size: Pair) -> Tensor:
         """The rays of the pixels, unit vectors (N, H', W', 3) in the camera's frame; 0 where the
         lens or the view sees nothing. size: (H, W) of the images."""
-        prepared = PixelView.prepare(self, lens, size, back=False)
-        assert prepared.rays is not None
-        return prepared.rays.movedim(1, -1)
+        return ray_channels(*self.pixel_rays(check_lens(lens, size), size)).movedim(1, -1)
 
     def _rays(self, lens: Lens, size: Pair, reads: int = 1) -> Tensor:
         height, width = self.size

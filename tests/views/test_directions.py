@@ -276,6 +276,13 @@ def test_each_pixel_takes_the_tile_in_which_it_is_farthest_from_a_border():
     torch.testing.assert_close(coarse, owner, rtol=0, atol=1e-4)
 
 
+def test_a_tile_that_sees_nothing_of_the_lens_has_no_rays():
+    lens = Equidistant(200.0, 0.3)
+    rays = make_view("tiles", (16, 16)).rays(lens, SIZE)
+    assert rays.shape == (1, 5, 16, 16, 3)
+    assert rays[0, 0].any() and not rays[0, 1:].any()
+
+
 def test_own_directions():
     directions = [(0, 0, 1), (1, 0, 0.2), (0, -1, 0.5)]
     view = make_view("tiles", (32, 48), directions=directions, tile_fov=1.5)
