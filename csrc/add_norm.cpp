@@ -5,8 +5,8 @@
 #include <optional>
 
 #include "checks.h"
-#include "dispatch.h"
-#include "parallel.h"
+#include "core/dispatch.h"
+#include "core/parallel.h"
 
 namespace darswin {
 namespace {

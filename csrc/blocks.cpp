@@ -10,8 +10,7 @@
 #include <numeric>
 #include <vector>
 
-#include "add_norm.h"
-#include "linear.h"
+#include "core/layers.h"
 #include "window_attention_call.h"
 
 namespace darswin {
@@ -86,105 +85,22 @@ Tensor pack_linear(Tensor weight, MaybeTensor bias, MaybeTensor weight_scale, do
   return packed;
 }
 
-// A packed linear layer. If its words are int32, it is quantized and reads tokens of 8 bits.
-struct Layer {
-  const Tensor& packed;
-  int64_t depth, columns;
-  bool is_quantized = packed.scalar_type() == ScalarType::Int;
-  float scale = 1;           // of a step of its tokens
-  Quantizer quantizer = {};  // of its tokens
-
-  Layer(const Tensor& packed_, int64_t depth_, int64_t columns_)
-      : packed(packed_), depth(depth_), columns(columns_) {
-    if (!is_quantized) {
-      check_parameter(packed, ScalarType::Float, layer_words<float>(depth, columns));
-      return;
-    }
-    STD_TORCH_CHECK(kernels<LinearKernels<uint8_t>>().rows != nullptr && cpu_has_vnni(), kName,
-                    ": this tier or this CPU has no products of 8 bits");
-    STD_TORCH_CHECK(depth <= kMostDepth, kName, ": sums of so many products do not fit 32 bits");
-    const int64_t count = layer_words<uint8_t>(depth, columns);
-    check_parameter(packed, ScalarType::Int, count + kLastWords);
-    const auto* last = pointer<int32_t>(packed) + count;
-    scale = std::bit_cast<float>(last[0]);
-    quantizer = {std::bit_cast<float>(last[1]), last[2]};
-  }
-};
-
-template <typename X>
-void multiply(const X* x, int64_t rows, const Layer& layer, void* out, After after,
-              const Layer* next) {
-  const int64_t depth = layer.depth, columns = layer.columns;
-  LinearArgs<X> args{.x = x,
-                     .packed = layer.packed.const_data_ptr(),
-                     .rows = rows,
-                     .depth = depth,
-                     .columns = columns,
-                     .scale = layer.scale,
-                     .after = after};
-  if (next != nullptr && next->is_quantized) {
-    args.quantized = static_cast<uint8_t*>(out);
-    args.quantizer = next->quantizer;
-  } else {
-    args.out = static_cast<float*>(out);
-  }
-  const auto& kernel = kernels<LinearKernels<X>>().rows;
-  constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
-  // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
-  constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
-  const double work = static_cast<double>(rows) * depth * columns;
-  const int64_t threads = threads_for(work / kPerMicrosecond);
-  const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
-  if (panels < threads || tiles >= 16 * threads) {
-    parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
-      kernel(args, begin * kRows, std::min(end * kRows, rows), 0, panels);
-    });
-  } else {
-    parallel_ranges(panels, threads,
-                    [&](int64_t begin, int64_t end) { kernel(args, 0, rows, begin, end); });
-  }
+// Returns a packed layer of this depth and these columns.
+Layer checked_layer(const Tensor& packed, int64_t depth, int64_t columns) {
+  const bool is_quantized = packed.scalar_type() == ScalarType::Int;
+  STD_TORCH_CHECK(!is_quantized || has_quantized_layers(), kName,
+                  ": this tier or this CPU has no products of 8 bits");
+  STD_TORCH_CHECK(!is_quantized || depth <= kMostDepth, kName,
+                  ": sums of so many products do not fit 32 bits");
+  check_parameter(packed, is_quantized ? ScalarType::Int : ScalarType::Float,
+                  Layer::words(depth, columns, is_quantized));
+  return Layer(packed.const_data_ptr(), depth, columns, is_quantized);
 }
 
-// Writes the linear layer of x to `out`, or its GELU, or adds it to `out`. The numbers of x are
-// what the layer reads, and the result is what `next` reads; without `next`, it is float. The
-// threads share the rows of a long map, or the columns of the result of a short map.
-void multiply(const void* x, int64_t rows, const Layer& layer, void* out,
-              After after = After::nothing, const Layer* next = nullptr) {
-  if (layer.is_quantized) {
-    multiply(static_cast<const uint8_t*>(x), rows, layer, out, after, next);
-  } else {
-    multiply(static_cast<const float*>(x), rows, layer, out, after, next);
-  }
-}
-
-template <typename Out>
-void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& parameters, double eps,
-               Out* out, Quantizer quantizer = {}) {
+// Returns a norm of the parameters (2, D).
+Norm checked_norm(const Tensor& parameters, int64_t dim, double eps) {
   check_parameter(parameters, ScalarType::Float, 2 * dim);
-  // Without a second summand, the kernel only reads x.
-  AddNormArgs<float, Out> args{.x = const_cast<float*>(x),
-                               .out = out,
-                               .weight = pointer<float>(parameters),
-                               .eps = static_cast<float>(eps),
-                               .width = dim,
-                               .quantizer = quantizer};
-  args.bias = args.weight + dim;
-  constexpr double kPerMicrosecond = 4000;  // numbers
-  const int64_t threads = threads_for(static_cast<double>(rows) * dim / kPerMicrosecond);
-  parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
-    kernels<AddNormKernels<float, Out>>().rows(args, begin, end);
-  });
-}
-
-// Writes the layer norm of the rows of x to `out`, as the layer `next` reads it. `parameters` is
-// the norm's weight and its bias, (2, D).
-void normalize(const float* x, int64_t rows, const Tensor& parameters, double eps, void* out,
-               const Layer& next) {
-  if (next.is_quantized) {
-    normalize(x, rows, next.depth, parameters, eps, static_cast<uint8_t*>(out), next.quantizer);
-  } else {
-    normalize(x, rows, next.depth, parameters, eps, static_cast<float*>(out));
-  }
+  return {pointer<float>(parameters), dim, static_cast<float>(eps)};
 }
 
 // Checks for tokens (..., D) of a type on the CPU, and returns them contiguous.
@@ -198,7 +114,8 @@ Tensor norm(Tensor x, Tensor parameters, double eps) {
   x = checked_tokens(x, ScalarType::Float);
   const int64_t dim = x.size(x.dim() - 1);
   const Tensor out = new_tensor(x.sizes(), ScalarType::Float);
-  normalize(pointer<float>(x), x.numel() / dim, dim, parameters, eps, mutable_pointer<float>(out));
+  normalize(pointer<float>(x), x.numel() / dim, checked_norm(parameters, dim, eps),
+            mutable_pointer<float>(out));
   return out;
 }
 
@@ -207,13 +124,14 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor n
   Sizes sizes = x.sizes().vec();
   const int64_t depth = sizes.back(), rows = x.numel() / depth;
   check_product({depth, columns});
-  const Layer layer(packed, depth, columns);
+  const Layer layer = checked_layer(packed, depth, columns);
   const ScalarType type = layer.is_quantized ? ScalarType::Byte : ScalarType::Float;
   x = checked_tokens(x, norm ? ScalarType::Float : type);
   if (norm || layer.is_quantized) {
     const Tensor tokens = new_tensor(Sizes{x.numel() + kSpare}, type);
     if (norm) {
-      normalize(pointer<float>(x), rows, *norm, eps, tokens.mutable_data_ptr(), layer);
+      normalize(pointer<float>(x), rows, checked_norm(*norm, depth, eps), tokens.mutable_data_ptr(),
+                &layer);
     } else {
       std::copy_n(pointer<uint8_t>(x), x.numel(), mutable_pointer<uint8_t>(tokens));
     }
@@ -227,49 +145,6 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor n
   return out;
 }
 
-// The blocks of a stage. They change the residual x in place. The tokens between two layers are
-// float, or have 8 bits in the same memory.
-struct Blocks {
-  int64_t heads, mlp_dim;
-  double eps;
-  Tensor x;
-  int64_t dim = x.size(3), rows = x.numel() / dim;
-  Tensor normed = new_tensor(x.sizes(), ScalarType::Float),
-         hidden = new_tensor(Sizes{rows, mlp_dim}, ScalarType::Float);
-  Tensor qkv =
-      new_tensor(Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads}, ScalarType::Float);
-
-  // Runs one block, given its six parameters, and the window, the shift and the periodic axes of
-  // its attention.
-  void block(const Tensor* parameters, const Tensor& table, const int64_t* windows) {
-    const Layer to_qkv(parameters[1], dim, 3 * dim), proj(parameters[2], dim, dim);
-    const Layer fc1(parameters[4], dim, mlp_dim), fc2(parameters[5], mlp_dim, dim);
-    auto* residual = mutable_pointer<float>(x);
-    void *tokens = normed.mutable_data_ptr(), *hidden_tokens = hidden.mutable_data_ptr();
-    normalize(residual, rows, parameters[0], eps, tokens, to_qkv);
-    multiply(tokens, rows, to_qkv, qkv.mutable_data_ptr());
-    attend(table, windows, proj);
-    multiply(tokens, rows, proj, residual, After::add);
-    normalize(residual, rows, parameters[3], eps, tokens, fc1);
-    multiply(tokens, rows, fc1, hidden_tokens, After::gelu, &fc2);
-    multiply(hidden_tokens, rows, fc2, residual, After::add);
-  }
-
-  // Reads `qkv` and writes `normed`, as the layer `next` reads it.
-  void attend(const Tensor& table, const int64_t* windows, const Layer& next) {
-    const auto pair = [&](int k) { return Sizes(windows + k, windows + k + 2); };
-    const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
-    AttentionCall<float> call(qkv, table, pair(0), pair(2), pair(4), scale);
-    if (next.is_quantized) {
-      call.args.quantized = mutable_pointer<uint8_t>(normed);
-      call.args.quantizer = next.quantizer;
-    } else {
-      call.args.out = mutable_pointer<float>(normed);
-    }
-    call.run(call.args.windows * heads, 2, kernels<WindowAttentionKernels<float>>().forward);
-  }
-};
-
 void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> tables, Sizes windows,
              int64_t heads, int64_t mlp_dim, double eps) {
   const size_t count = tables.size();
@@ -280,9 +155,30 @@ void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> table
   if (x.numel() == 0) return;
   check_product({x.size(3), mlp_dim});
   check_product({x.numel() / x.size(3), mlp_dim});
-  Blocks blocks{heads, mlp_dim, eps, x};
+  const int64_t dim = x.size(3), tokens = x.numel() / dim;
+  Tensor scratch = new_tensor(Sizes{0}, ScalarType::Byte);
+  const Tensor none =
+      new_tensor(Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads}, ScalarType::Float);
   for (size_t k = 0; k < count; ++k) {
-    blocks.block(&parameters[6 * k], tables[k], &windows[6 * k]);
+    const Tensor* p = &parameters[6 * k];
+    const int64_t* w = &windows[6 * k];
+    // Without numbers: it checks the table, and finds the windows.
+    const auto pair = [&](int at) { return Sizes(w + at, w + at + 2); };
+    const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
+    const int64_t table_rows = tables[k].size(0);
+    AttentionCall<float> call(none, tables[k], pair(0), pair(2), pair(4), scale);
+    call.args.windows /= x.size(0);
+    const Block block{.norm1 = checked_norm(p[0], dim, eps),
+                      .norm2 = checked_norm(p[3], dim, eps),
+                      .qkv = checked_layer(p[1], dim, 3 * dim),
+                      .proj = checked_layer(p[2], dim, dim),
+                      .fc1 = checked_layer(p[4], dim, mlp_dim),
+                      .fc2 = checked_layer(p[5], mlp_dim, dim),
+                      .windows = call.args};
+    const int64_t bytes = block.scratch(tokens);
+    if (scratch.numel() < bytes) scratch = new_tensor(Sizes{bytes}, ScalarType::Byte);
+    block.run(mutable_pointer<float>(x), x.size(0), pointer<float>(call.bias), table_rows,
+              scratch.mutable_data_ptr());
   }
 }
 

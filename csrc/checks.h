@@ -12,8 +12,8 @@
 #include <optional>
 #include <vector>
 
+#include "core/parallel.h"
 #include "numbers.h"
-#include "parallel.h"
 
 namespace darswin {
 

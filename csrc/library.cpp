@@ -6,8 +6,8 @@
 
 #include <string>
 
-#include "dispatch.h"
-#include "parallel.h"
+#include "core/dispatch.h"
+#include "core/parallel.h"
 
 // The arguments that polar_sample and its backward share. Their order is that of the fields of
 // struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
@@ -55,7 +55,12 @@ STABLE_TORCH_LIBRARY(darswin, m) {
       "int mlp_dim, float eps) -> ()");
 }
 
-int64_t darswin::num_threads() { return torch::stable::get_num_threads(); }
+namespace {
+
+[[maybe_unused]] const auto as_torch =
+    darswin::thread_setting = [] { return static_cast<int64_t>(torch::stable::get_num_threads()); };
+
+}  // namespace
 
 // Facts about the module, which darswin/ops/_module.py reads.
 #define FACT extern "C" __attribute__((visibility("default")))

@@ -7,8 +7,8 @@
 #include <vector>
 
 #include "checks.h"
-#include "dispatch.h"
-#include "parallel.h"
+#include "core/dispatch.h"
+#include "core/parallel.h"
 #include "polar.h"
 
 namespace darswin {

@@ -6,8 +6,8 @@
 #include <vector>
 
 #include "checks.h"
-#include "dispatch.h"
-#include "parallel.h"
+#include "core/dispatch.h"
+#include "core/parallel.h"
 
 namespace darswin {
 namespace {

@@ -2,8 +2,7 @@
 #pragma once
 
 #include "checks.h"
-#include "dispatch.h"
-#include "parallel.h"
+#include "core/attention.h"
 #include "window_attention.h"
 
 namespace darswin {
@@ -60,15 +59,10 @@ struct AttentionCall {
     return {qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim};
   }
 
-  // `steps` counts the products that the kernel computes for each pair, such as query times key.
+  // As `run_attention`.
   template <typename Kernel>
   void run(int64_t items, int64_t steps, Kernel kernel) {
-    constexpr double kPerMicrosecond = 2e4;  // multiply-adds, on a CPU with AVX2
-    const int64_t tokens = args.window_r * args.window_a;
-    const double work = static_cast<double>(args.windows) * args.heads * tokens * tokens;
-    run_with_scratch(items, threads_for(work * args.head_dim * steps / kPerMicrosecond),
-                     kernels<WindowAttentionKernels<T>>().scratch(args),
-                     [&](auto... range) { kernel(args, range...); });
+    run_attention(args, items, steps, kernel);
   }
 };
 

@@ -13,7 +13,7 @@
 #include <thread>
 #include <vector>
 
-#include "../dispatch.h"
+#include "../core/dispatch.h"
 
 // glibc 2.34 gave the same function a new version (see portable.cpp).
 #if defined(__GLIBC__) && defined(__x86_64__)

@@ -73,8 +73,24 @@ class ThreadMemory {
   static inline thread_local size_t size = 0;
 };
 
-// The number of threads that torch's settings allow. library.cpp asks torch.
+// The number of threads that the caller allows: that of the innermost ThreadLimit of this thread,
+// else that of `thread_setting`.
 int64_t num_threads();
+
+// Says how many threads a call may use without a ThreadLimit. In libdarswin.so this is torch's
+// setting; without torch it is one thread.
+extern int64_t (*thread_setting)();
+
+// Sets the number of threads that calls of this thread may use, for the lifetime of this object.
+class ThreadLimit {
+ public:
+  explicit ThreadLimit(int64_t threads);
+  ~ThreadLimit();
+  ThreadLimit(const ThreadLimit&) = delete;
+
+ private:
+  int64_t before;
+};
 
 // Returns the number of threads that is worth starting for so many microseconds of work. The second
 // thread takes about two microseconds to begin, and more if it has fallen asleep.

@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "tier.h"
+#include "../tier.h"
 
 namespace darswin {
 
