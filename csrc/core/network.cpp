@@ -211,8 +211,10 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a, int64_t) const {
           last += product({sizes[axis] - 1, sizes[kCopyAxes * (1 + side) + axis]});
           product({last});
         }
-        require(last < (slot < first ? inputs[slot] : buffers[slot - first]),
-                "copies beyond a slot");
+        const int64_t numbers = slot < first ? inputs[slot] : buffers[slot - first];
+        require(last < numbers, "copies beyond a slot");
+        require(side == 0 || product({a[4], a[5], a[6], a[7], a[8]}) <= numbers,
+                "copies to a place twice");
       }
       break;
     }

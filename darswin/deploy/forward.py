@@ -100,7 +100,8 @@ class _UnetRun:
             return unet.head.finish(view.back(logits.permute(0, 3, 1, 2), prepared))
         (maps,) = _RUN(inputs, self.weights, self.words)
         pixels = view.back(maps, prepared)
-        if images is not None:
+        if unet.refines_with_images:
+            assert images is not None
             images = view.floating(images, torch.float32)
             refuse_gradients(images)
             given = [pixels.permute(0, 2, 3, 1), images.float(), *rays]
