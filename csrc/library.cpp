@@ -50,9 +50,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "
       "float eps=1e-05) -> Tensor");
-  m.def(
-      "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "
-      "int mlp_dim, float eps) -> ()");
   m.def("_run(Tensor[] inputs, Tensor weights, int[] program) -> Tensor[]");
 }
 
