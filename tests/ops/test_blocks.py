@@ -213,7 +213,7 @@ def test_blocks_that_do_not_fit():
     words, weights = blocks.words, blocks.weights.words
     assert words[-25] == BLOCK and (blocks.heads, blocks.mlp_dim) == (3, 60)
     wrong = {1: (9, 0), 2: (0,), 3: (20,), 4: (0, -3, 5), 5: (0, 2**61), 6: (-1, 2**40),
-             7: (-1, weights.numel()), 8: (1, 2), 16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,),
+             7: (-1, weights.numel()), 8: (2,), 16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,),
              22: (0, 2)}  # fmt: skip
     for place, values in wrong.items():
         for value in values:
