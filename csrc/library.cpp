@@ -81,10 +81,10 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
+// The compiler, the C++ standard and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
-  static const std::string info =
-      R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" + std::to_string(__cplusplus) +
-      R"(, "openmp": )" + std::to_string(_OPENMP) + R"(, "torch_abi": "stable, torch>=2.10"})";
+  static const std::string info = R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" +
+                                  std::to_string(__cplusplus) +
+                                  R"(, "torch_abi": "stable, torch>=2.10"})";
   return info.c_str();
 }

@@ -7,7 +7,7 @@ import ctypes
 import json
 from pathlib import Path
 
-import torch  # before the module: both must share the libgomp that torch loads
+import torch
 
 FILE = Path(__file__).parent.parent / "libdarswin.so"
 
@@ -62,7 +62,7 @@ def set_tier(tier: str) -> None:
 
 
 def build_info() -> dict[str, str | int]:
-    """Facts about the module's build: compiler, cxx_standard, openmp, torch_abi."""
+    """Facts about the module's build: compiler, cxx_standard, torch_abi."""
     return json.loads(_loaded.darswin_build_info())
 
 
