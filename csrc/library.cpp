@@ -81,6 +81,13 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
+// Says whether 8-bit layers may use the CPU's products of four bytes, as they do at first. The
+// results are the same. Returns true if they use them now.
+FACT bool darswin_allow_fours(bool allowed) {
+  darswin::allow_fours(allowed);
+  return darswin::has_fours();
+}
+
 // The compiler, the C++ standard and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
   static const std::string info = R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" +

@@ -84,8 +84,6 @@ Tensor pack_linear(Tensor weight, MaybeTensor bias, MaybeTensor weight_scale, do
 // Returns a packed layer of this depth and these columns.
 Layer checked_layer(const Tensor& packed, int64_t depth, int64_t columns) {
   const bool is_quantized = packed.scalar_type() == ScalarType::Int;
-  STD_TORCH_CHECK(!is_quantized || has_quantized_layers(), kName,
-                  ": this tier or this CPU has no products of 8 bits");
   STD_TORCH_CHECK(!is_quantized || depth <= kMostDepth, kName,
                   ": sums of so many products do not fit 32 bits");
   check_parameter(packed, is_quantized ? ScalarType::Int : ScalarType::Float,

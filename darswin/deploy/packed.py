@@ -24,7 +24,6 @@ from darswin.deploy.program import RUN, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
-from darswin.ops import cpu_capability
 
 __all__ = ["fastest_dtype"]
 
@@ -41,9 +40,8 @@ _ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
 
 
 def has_own_int8() -> bool:
-    """True if our own kernels compute 8-bit products here. On CPUs with AMX, oneDNN uses AMX."""
-    has_vnni = torch.cpu._is_vnni_supported() and not torch.cpu._is_amx_tile_supported()
-    return has_vnni and cpu_capability() == "avx512"
+    """True if our own kernels compute 8-bit products here: not where oneDNN uses AMX."""
+    return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
 class OwnBlocks:

@@ -36,6 +36,8 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_allow_fours.argtypes = [ctypes.c_bool]
+    module.darswin_allow_fours.restype = ctypes.c_bool
     return module
 
 
@@ -59,6 +61,15 @@ def set_tier(tier: str) -> None:
         raise ValueError(
             f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
         )
+
+
+def allow_fours(allowed: bool) -> bool:
+    """Says whether 8-bit layers may use instructions for four bytes at a time, such as VNNI.
+
+    They may at first. The results are the same. Returns True if the CPU and the tier have them, and
+    they are allowed.
+    """
+    return _loaded.darswin_allow_fours(allowed)
 
 
 def build_info() -> dict[str, str | int]:
