@@ -83,10 +83,16 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
+#if defined(__clang__)
+#  define COMPILER "clang++ " __clang_version__
+#else
+#  define COMPILER "g++ " __VERSION__
+#endif
+
 // The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
   static const std::string info =
-      R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" + std::to_string(__cplusplus) +
+      R"({"compiler": ")" COMPILER R"(", "cxx_standard": )" + std::to_string(__cplusplus) +
       R"(, "openmp": )" + std::to_string(_OPENMP) + R"(, "torch_abi": "stable, torch>=2.10"})";
   return info.c_str();
 }
