@@ -88,9 +88,15 @@ FACT bool darswin_allow_fours(bool allowed) {
   return darswin::has_fours();
 }
 
+#if defined(__clang__)
+#  define COMPILER "clang++ " __clang_version__
+#else
+#  define COMPILER "g++ " __VERSION__
+#endif
+
 // The compiler, the C++ standard and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
-  static const std::string info = R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" +
+  static const std::string info = R"({"compiler": ")" COMPILER R"(", "cxx_standard": )" +
                                   std::to_string(__cplusplus) +
                                   R"(, "torch_abi": "stable, torch>=2.10"})";
   return info.c_str();
