@@ -7,6 +7,7 @@ All results are published, also those where a peer is faster.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,11 +17,20 @@ from darswin.bench import targets
 from darswin.bench.machine import THREADS, machine, num_threads, on_other_tiers
 from darswin.bench.plot import Rows, draw_panels, in_lines
 from darswin.bench.record import Record
-from darswin.bench.tables import by_case, markdown, milliseconds, ratios
+from darswin.bench.start import Start
+from darswin.bench.tables import (
+    by_case,
+    markdown,
+    milliseconds,
+    paced_table,
+    ratios,
+    starts_table,
+)
 from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
+T = TypeVar("T")
 
 
 def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
@@ -98,11 +108,32 @@ def compare(
     return measure(case, steps, seconds, targets=targets)
 
 
+def on_torch_threads(run: Callable[[], T]) -> Callable[[int], Callable[[], T]]:
+    """A function for each number of threads, `DEFAULT` included, that calls `run` on so many of
+    torch's."""
+
+    def on(threads: int) -> Callable[[], T]:
+        def step() -> T:
+            if torch.get_num_threads() != (count := threads or max(THREADS)):
+                torch.set_num_threads(count)  # only before the first frame of a turn
+            return run()
+
+        return step
+
+    return on
+
+
 def run_suite(
-    suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
+    suite: str,
+    jobs: Sequence[Callable[[], list[Timing]]],
+    avx2_share: float,
+    out: Path | None,
+    paced: Sequence[Callable[[], list[Timing]]] = (),
+    starts: Sequence[Callable[[], list[Start]]] = (),
 ) -> list[Timing]:
-    """Runs jobs at one and at all threads, prints tables and targets, and writes the record and its
-    plot to the folder `out`. On the AVX2 tier, the targets are `avx2_share` of the others."""
+    """Runs jobs at one and at all threads, and those at the pace of a camera, which choose their
+    threads themselves; prints tables and targets, and writes the record and its plot to the folder
+    `out`. On the AVX2 tier, the targets are `avx2_share` of the others."""
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()))
     timings: list[Timing] = []
@@ -110,11 +141,20 @@ def run_suite(
         for threads in THREADS:
             with num_threads(threads):
                 timings += job()
+    for job in tqdm(paced, unit="case", desc="at a camera's pace", disable=not paced):
+        with num_threads(max(THREADS)):
+            timings += job()
+    started = [start for job in starts for start in job()]
     for subject in dict.fromkeys(t.subject for t in timings):
         print(peers_table(timings, subject), end="\n\n")
+    if paced:
+        print(paced_table(timings), end="\n\n")
+    if starts:
+        print(starts_table(started), end="\n\n")
     print(*targets.lines(timings, avx2_share), sep="\n")
+    print(*targets.paced_lines(timings), *targets.start_lines(started), sep="\n")
     if out:
-        Record(head, timings).publish(out, suite, draw_peers)
+        Record(head, timings, starts=started).publish(out, suite, draw_peers)
     return timings
 
 
