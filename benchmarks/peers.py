@@ -23,10 +23,11 @@ from darswin.bench.tables import (
     markdown,
     milliseconds,
     paced_table,
+    pivot,
     ratios,
     starts_table,
 )
-from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
+from darswin.bench.timing import DEFAULT, MATMULS, OURS, REFERENCE, Case, Timing, measure
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
@@ -186,10 +187,10 @@ def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = 
 
 
 def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
-    """A row a model and batch in float32, a column a peer with its time over ours."""
-    rows = []
+    """A row a model and batch in float32, in a loop; a column a peer with its time over ours."""
+    in_float32, rows = [t for t in timings if t.mode.startswith("forward, float32")], []
     for subject in dict.fromkeys(t.subject for t in timings):
-        chosen = [t for t in timings if t.subject == subject and "float32" in t.mode]
+        chosen = [t for t in in_float32 if t.subject == subject]
         for (setting, batch, _), found in by_case(chosen).items():
             over = [ratios(found.get(peer, ()), 2) for peer in peers]
             rows.append(
@@ -198,16 +199,38 @@ def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     return markdown(["", "ours (ms)", *peers], rows)
 
 
+def single_frames(timings: Sequence[Timing]) -> list[Timing]:
+    """One frame of one camera: at its pace, or in a loop in a record that has only that."""
+    chosen = [t for t in timings if t.batch == 1 and t.mode.endswith("fixed lens")]
+    return [t for t in chosen if t.paced] or chosen
+
+
 def latency_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     """The milliseconds of one frame: a row for each model and dtype, a column for each runtime."""
-    rows = []
-    for subject in dict.fromkeys(t.subject for t in timings):
-        chosen = [t for t in timings if t.subject == subject and t.batch == 1]
+    frames, rows = [t for t in single_frames(timings) if t.threads != DEFAULT], []
+    for subject in dict.fromkeys(t.subject for t in frames):
+        chosen = [t for t in frames if t.subject == subject]
         for (setting, _, mode), found in by_case(chosen).items():
             _, dtype, _ = mode.split(", ")
             times = [milliseconds(found.get(name, ())) for name in (OURS, *peers)]
             rows.append([f"`{subject}`, {setting}, {dtype}", *times])
     return markdown(["", "`optimize`", *peers], rows)
+
+
+def camera_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
+    """The ms of one frame in float32 with default threads, or with all in a record of loops alone:
+    a row for each runtime, a column for each model."""
+    frames = [t for t in single_frames(timings) if "float32" in t.mode]
+    paced = any(t.paced for t in frames)
+    threads = DEFAULT if paced else max(t.threads for t in frames)
+    return pivot(
+        f"one frame {'every 33 ms' if paced else 'in a loop'}: p50 (p99)",
+        (
+            (t.name, f"`{t.subject}`", f"{1e3 * t.median:.2f} ({1e3 * (t.p99 or 0):.2f})")
+            for t in frames
+            if t.threads == threads and t.name in (OURS, *peers)
+        ),
+    )
 
 
 def attention_table(timings: Sequence[Timing]) -> str:

@@ -100,7 +100,8 @@ def _paced_cell(t: Timing) -> tuple[str, str, str]:
     assert t.p99 is not None and t.cpu is not None
     what = t.mode.partition(", ")[2]
     row = f"`{t.subject}`, {t.setting}, {what}, {threads_label(t.threads)}"
-    return row, t.name, " / ".join(f"{1e3 * x:.3g}" for x in (t.median, t.p99, t.cpu))
+    times = (float(f"{1e3 * seconds:.3g}") for seconds in (t.median, t.p99, t.cpu))
+    return row, t.name, " / ".join(f"{time:g}" for time in times)
 
 
 def starts_table(starts: Iterable[Start]) -> str:
