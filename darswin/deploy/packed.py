@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
-from darswin.ops import cpu_capability
+from darswin.ops import _module, cpu_capability
 
 __all__ = ["fastest_dtype"]
 
@@ -29,6 +29,8 @@ _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 def own_operator(name: str) -> Callable[..., Any]:
     """One of our operators for the CPU."""
+    if _module.LACK is not None:
+        return partial(_module.require, name)
     # Not by way of autograd, which would look for gradients and count versions: there are none.
     return partial(getattr(_OPS, name).default.redispatch, _CPU)
 
