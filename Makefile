@@ -165,7 +165,7 @@ wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a f
 DEST := dist
 repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
-	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
+	  --exclude 'libtorch*' --exclude 'libc10*' "$(WHEEL)"
 
 published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
 	$(BIN)/cibuildwheel --output-dir dist

@@ -94,8 +94,7 @@ def test_tiers_can_be_forced_and_agree():
 
 def test_build_info():
     info = _module.build_info()
-    assert info["cxx_standard"] >= 202002 and info["openmp"] >= 201511
-    assert "stable" in info["torch_abi"]
+    assert info["cxx_standard"] >= 202002 and "stable" in info["torch_abi"]
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +167,7 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
     assert any("libtorch_cpu.so" in line for line in needed) == (path != FRAMES)
-    assert any("libgomp" in line for line in needed) == (path != FRAMES)
+    assert not any("omp" in line for line in needed)
     assert not any("/" in line.split("[")[1] for line in needed)
 
 
