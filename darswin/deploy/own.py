@@ -9,12 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.quantized import Quantization, quantized_layers
+from darswin.ops import _module
 
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
 def own_operator(name: str) -> Callable[..., Any]:
-    """One of our operators for the CPU."""
+    """One of our operators for the CPU. Without the compiled module, it refuses calls."""
+    if _module.LACK is not None:
+        return partial(_module.require, name)
     # Not by way of autograd, which would look for gradients and count versions: there are none.
     return partial(getattr(torch.ops.darswin, name).default.redispatch, _CPU)
 
