@@ -32,7 +32,7 @@ def pythons() -> str:
 
 class CMakeBuild(build_ext):
     def get_ext_filename(self, fullname):
-        if fullname.endswith("libdarswin"):
+        if fullname.rpartition(".")[2].startswith("libdarswin"):
             return fullname.replace(".", "/") + ".so"
         return super().get_ext_filename(fullname)
 
@@ -67,7 +67,8 @@ class PlatformWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+MODULES = ("libdarswin", "frames._frames", "frames.libdarswin_frames")
 setup(
-    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin.frames._frames", [])],
+    ext_modules=[Extension(f"darswin.{name}", []) for name in MODULES],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )
