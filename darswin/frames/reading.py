@@ -1,7 +1,7 @@
 """The points at which models, layers and views read an image."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ class Reading(NamedTuple):
     """The points at which images of one size are read, and the usual form of the result."""
 
     points: PolarGrid | Tensor  # the polar grid of one lens, or pixels (H', W', 2)
-    output: str  # of `Plan`
+    output: Literal["tokens", "image"]  # of `Plan`
     samples: Pair | None  # (S_r, S_φ) of a token of the grid
     channels: int | None  # of the frames, if the sampling says it
     # The normalization of frames; None if the sampling has none of its own.
@@ -45,3 +45,10 @@ def reading(sample: nn.Module, lens: Lens, size: Pair) -> Reading:
     assert isinstance(points, Tensor)
     reads = view.reads_of(size) if isinstance(view, PixelView) else 1
     return Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)
+
+
+def every_pixel(model: Model, size: Pair) -> Reading:
+    """The points of a model that takes images of (H, W) as they are."""
+    y, x = (torch.arange(side, dtype=torch.float64) for side in size)
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    return Reading(points, "image", None, model.in_chans, model.mean, model.std)
