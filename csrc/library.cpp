@@ -53,6 +53,7 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "
       "int mlp_dim, float eps) -> ()");
+  m.def("_run(Tensor[] inputs, Tensor weights, int[] program) -> Tensor[]");
 }
 
 namespace {

@@ -35,10 +35,11 @@ inline void ask_for_large_pages(void* memory, size_t bytes) {
 // Working memory of the calling thread, for the lifetime of this object. It has at least `bytes`
 // bytes, is aligned to cache lines and is not initialized. Up to kKept bytes stay with the thread
 // between uses, because fresh pages cost more than the work of the kernels in them. So a thread can
-// have only one of these objects at a time. Throws std::bad_alloc.
-class ThreadMemory {
+// have only one of these objects of each kind at a time. Throws std::bad_alloc.
+template <int kKind>
+class ThreadMemoryOf {
  public:
-  explicit ThreadMemory(size_t bytes) {
+  explicit ThreadMemoryOf(size_t bytes) {
     if (bytes <= size) return;
     free();
     if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
@@ -47,10 +48,10 @@ class ThreadMemory {
     ask_for_large_pages(memory.get(), bytes);
     size = bytes;
   }
-  ~ThreadMemory() {
+  ~ThreadMemoryOf() {
     if (size > kKept) free();
   }
-  ThreadMemory(const ThreadMemory&) = delete;
+  ThreadMemoryOf(const ThreadMemoryOf&) = delete;
 
   void* get() const { return memory.get(); }
 
@@ -72,6 +73,7 @@ class ThreadMemory {
   static inline thread_local std::unique_ptr<void, Free> memory;
   static inline thread_local size_t size = 0;
 };
+using ThreadMemory = ThreadMemoryOf<0>;
 
 // The number of threads that the caller allows: that of the innermost ThreadLimit of this thread,
 // else that of `thread_setting`.

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
+from darswin.deploy.forward import Run, compiled
 from darswin.deploy.packed import fastest_dtype
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
@@ -88,6 +89,8 @@ def optimize(
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
+            if dtype == torch.float32 and part is optimized:
+                vars(part).update(compiled=compiled(part))
     return optimized
 
 
@@ -124,6 +127,12 @@ class Optimized(Model[Any]):
     dtype = torch.float32  # of the original weights
     fixed_lens: Lens | None = None
     known: dict[Pair, Prepared]  # the result of `prepare` for the fixed lens and each size
+    compiled: Run | None = None  # `forward_network` as programs
+
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        if self.compiled is None:
+            return super().forward_network(x, prepared, images)
+        return self.compiled(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         if self.fixed_lens is None:

@@ -27,17 +27,18 @@ _OPS = torch.ops.darswin
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
-def _operator(name: str) -> Callable[..., Any]:
+def own_operator(name: str) -> Callable[..., Any]:
+    """One of our operators for the CPU."""
     # Not by way of autograd, which would look for gradients and count versions: there are none.
     return partial(getattr(_OPS, name).default.redispatch, _CPU)
 
 
-_ADD_NORM = _operator("_add_norm_")
-_ADD_NORM_QUANTIZED = _operator("_add_norm_quantized_")
-_NORM = _operator("_norm")
-_PACK = _operator("_pack_linear")
-_LINEAR = _operator("_linear")
-_BLOCKS = _operator("_blocks_")
+_ADD_NORM = own_operator("_add_norm_")
+_ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
+_NORM = own_operator("_norm")
+_PACK = own_operator("_pack_linear")
+_LINEAR = own_operator("_linear")
+_BLOCKS = own_operator("_blocks_")
 
 
 def has_own_int8() -> bool:
@@ -60,22 +61,75 @@ def norm_parameters(norm: nn.LayerNorm) -> Tensor:
     return torch.stack((norm.weight, norm.bias)).detach().float()
 
 
-def packed_blocks(blocks: Sequence[Any]) -> tuple[list[Tensor], list[int], int, int, float]:
-    """The blocks of a stage as arguments of `_blocks_`: all but the map and the position biases."""
-    parameters: list[Tensor] = []
-    windows: list[int] = []
-    for block in blocks:
-        attn, mlp = block.attn, block.mlp
-        parameters += [
-            norm_parameters(block.norm1),
-            packed_weights(attn.qkv),
-            packed_weights(attn.proj),
-            norm_parameters(block.norm2),
-            packed_weights(mlp.fc1),
-            packed_weights(mlp.fc2),
+def pack(weight: Tensor, bias: Tensor | None) -> Tensor:
+    """A weight (D', D) and a bias as `_linear` reads them, (K,) float32."""
+    return _PACK(weight.detach().float(), None if bias is None else bias.detach().float())
+
+
+class OwnLinear:
+    """A linear layer by our own operators, behind a norm or before a GELU if asked."""
+
+    def __init__(
+        self, packed: Tensor, columns: int, *, gelu: bool = False, norm: "OwnNorm | None" = None
+    ):
+        self.packed, self.columns, self.gelu, self.norm = packed, columns, gelu, norm
+        self._given: tuple = (packed, columns, gelu)
+        if norm is not None:
+            self._given = (*self._given, norm.parameters, norm.eps)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return _LINEAR(x, *self._given)
+
+
+class OwnNorm:
+    """A layer norm by our own operators."""
+
+    def __init__(self, norm: nn.LayerNorm):
+        self.eps = norm.eps
+        eps = torch.tensor([norm.eps])
+        # As the programs of networks have it: the weight, the bias and eps.
+        self.words = torch.cat((norm_parameters(norm).flatten(), eps))
+        self.parameters = norm_parameters(norm)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return _NORM(x, self.parameters, self.eps)
+
+
+class OwnBlocks:
+    """The blocks of a stage by one operator. All of them have window attention."""
+
+    def __init__(self, blocks: Sequence[Any]):
+        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
+        self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
+            (
+                OwnNorm(block.norm1),
+                packed_weights(block.attn.qkv),
+                packed_weights(block.attn.proj),
+                OwnNorm(block.norm2),
+                packed_weights(block.mlp.fc1),
+                packed_weights(block.mlp.fc2),
+            )
+            for block in blocks
         ]
-        windows += [*attn.window, *attn.shift, *attn.periodic]
-    return parameters, windows, attn.num_heads, mlp.fc1.out_features, block.norm1.eps
+        # Of each block: the window, the shift, and whether an axis is periodic.
+        self.windows: list[list[int]] = [
+            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
+        ]
+        self.heads, self.mlp_dim = blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features
+        parameters = [
+            part.parameters if isinstance(part, OwnNorm) else part
+            for layers in self.layers
+            for part in layers
+        ]
+        windows = [number for of_block in self.windows for number in of_block]
+        # Of `_blocks_`, all but the map and the position biases.
+        self.arguments = parameters, windows, self.heads, self.mlp_dim, blocks[0].norm1.eps
+
+    def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        x = x.contiguous()
+        parameters, *given = self.arguments
+        _BLOCKS(x, parameters, tables, *given)
+        return x
 
 
 class Own:
@@ -83,28 +137,18 @@ class Own:
 
     def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
         """A linear layer, behind a norm or before a GELU if asked."""
-        given: tuple = (packed_weights(layer), layer.out_features, gelu)
-        if norm is not None:
-            given = (*given, norm_parameters(norm), norm.eps)
-        return lambda x: _LINEAR(x, *given)
+        before = None if norm is None else OwnNorm(norm)
+        return OwnLinear(packed_weights(layer), layer.out_features, gelu=gelu, norm=before)
 
     def norm(self, norm: nn.LayerNorm) -> Layer:
         """A layer norm."""
-        parameters = norm_parameters(norm)
-        return lambda x: _NORM(x, parameters, norm.eps)
+        return OwnNorm(norm)
 
     def blocks(self, blocks: Sequence[Any]) -> Blocks:
         """The blocks of a stage: one operator, if all of them have window attention."""
         if not blocks or not all(_has_windows(block.attn) for block in blocks):
             return OneDNN(torch.float32).blocks(blocks)
-        parameters, *given = packed_blocks(blocks)
-
-        def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-            x = x.contiguous()
-            _BLOCKS(x, parameters, tables, *given)
-            return x
-
-        return run
+        return OwnBlocks(blocks)
 
 
 class OneDNN(Own):

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
 from torch import nn
 
-from darswin.deploy.packed import Own, norm_parameters, packed_blocks, packed_weights
+from darswin.deploy.packed import Own, OwnBlocks, norm_parameters, packed_weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
@@ -205,7 +205,7 @@ def test_wrong_arguments():
 
     blocks = stage(depth=1)
     table = blocks[0].attn.position_bias().contiguous()
-    parameters, windows, heads, mlp_dim, eps = packed_blocks(blocks)
+    parameters, windows, heads, mlp_dim, eps = OwnBlocks(blocks).arguments
     assert (heads, mlp_dim, eps) == (3, 60, 1e-5)
     given = dict(
         x=torch.zeros(1, 8, 16, 24), parameters=parameters, tables=[table], windows=windows,
