@@ -11,7 +11,7 @@ import darswin
 MODULES = [
     importlib.import_module(found.name)
     for found in pkgutil.walk_packages(darswin.__path__, "darswin.")
-    if not found.name.endswith(("__main__", "libdarswin"))
+    if not found.name.endswith(("__main__", "libdarswin", "libdarswin_frames"))
 ]
 
 

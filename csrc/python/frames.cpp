@@ -158,7 +158,7 @@ py::object run_network(const FrameNetwork& network, const py::object& given, con
 }
 
 // Returns a function that runs the network of a file, and what the file says of it: the size of the
-// frames, the shapes of the outputs, whether they are a list, and the labels.
+// frames, the shapes of the outputs, and the labels.
 py::tuple open_network(const std::string& path) {
   std::shared_ptr<const FrameNetwork> network;
   try {
@@ -181,7 +181,7 @@ py::tuple open_network(const std::string& path) {
   for (const std::string& label : network->labels()) labels.append(py::str(label));
   return py::make_tuple(run,
                         py::make_tuple(network->height(), network->width(), network->channels()),
-                        shapes, network->finish() == FrameNetwork::Finish::list, labels);
+                        shapes, labels);
 }
 
 // Finds the places of the points of one polar grid among the pixels of images of one size.

@@ -40,9 +40,11 @@ class Frames(Protocol):
         """A function that samples frames at the places of a plan."""
 
     @staticmethod
-    def network(path: bytes, /) -> tuple[Run, tuple[int, int, int], list, bool, list[str]]:
+    def network(
+        path: bytes, /
+    ) -> tuple[Run, tuple[int, int, int], list[tuple[int, ...]], list[str]]:
         """A function that runs the network of a file; (H, W, C) of its frames, the shapes of its
-        outputs, whether its result is a list, and its labels."""
+        outputs, and its labels."""
 
     @staticmethod
     def polar_places(

@@ -46,10 +46,8 @@ class Network:
     """
 
     def __init__(self, path: str | os.PathLike):
-        self._run, (*size, self.channels), self.shapes, self.labels = frames.network(
-            os.fsencode(path)
-        )
-        self.size = tuple(size)
+        self._run, size, self.shapes, self.labels = frames.network(os.fsencode(path))
+        self.size, self.channels = size[:2], size[2]
 
     def __call__(self, frame: np.ndarray, out: Any = None, threads: int = 1) -> Any:
         return self._run(frame, out, threads)
@@ -97,8 +95,10 @@ def export(
 
     from darswin.deploy.forward import frame_program
     from darswin.deploy.optimize import optimize
+    from darswin.deploy.program import NoProgramError
     from darswin.frames.reading import every_pixel, reading
     from darswin.layers.quantized import quantized_layers
+    from darswin.models.encoder import FeatureMaps
 
     check_name(path)
     size = check_size(size)
@@ -113,12 +113,22 @@ def export(
     names = list(model.pretrained_cfg.get("label_names", ()) if labels is None else labels)
     if names and (len(names) != model.num_classes or not all(isinstance(n, str) for n in names)):
         raise ValueError(f"labels must be {model.num_classes} names, one for each class")
-    found = reading(model, lens, size) if model.view.uses_lens else every_pixel(model, size)
+    if model.view.uses_lens:
+        found = reading(model, lens, size, exact=False)
+    else:
+        found = every_pixel(model, size)
     plan = plan_of(model, found, size, found.output, mean, std)
-    with torch.no_grad():
-        program = frame_program(fast, fast.prepare(lens, size))
+    try:
+        with torch.no_grad():
+            program = frame_program(fast, fast.prepare(lens, size))
+    except NoProgramError as error:
+        raise TypeError(
+            f"model must be a classifier, a backbone or a Unet that a file can contain, got "
+            f"{type(model).__name__}: {error}"
+        ) from error
     constants = [np.zeros(0, np.float32), *(one.numpy().ravel() for one in program.constants)]
-    finish = "probabilities" if program.is_classifier else "array"
+    is_list = isinstance(model, FeatureMaps)
+    finish = "probabilities" if program.is_classifier else "list" if is_list else "array"
     write_arrays(
         path,
         {f"plan.{name}": value for name, value in plan.parts().items()}
@@ -128,7 +138,7 @@ def export(
             weights=program.weights.numpy(),
             reads_frame=int(program.reads_frame),
             constants=np.concatenate(constants),
-            finish="list" if program.is_list else finish,
+            finish=finish,
             labels=np.array(names, str),
         ),
     )

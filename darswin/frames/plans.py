@@ -300,11 +300,11 @@ def plan_of(
             "and the std of its network"
         )
     channels = found.channels or max(np.size(mean), np.size(std))
+    points: Any = found.points
     if found.samples is None:
-        points = found.points.double().numpy()
-        arrays = _at_pixels(points, size, output, found.tiles, found.reads)
+        arrays = _at_pixels(points.double().numpy(), size, output, found.tiles, found.reads)
     else:
-        arrays = _on_grid(found.points, found.samples, size, output)
+        arrays = _on_grid(points, found.samples, size, output)
     return Plan(
         **arrays,
         size=size,

@@ -27,16 +27,20 @@ class Reading(NamedTuple):
 
 
 @torch.no_grad()
-def reading(sample: nn.Module, lens: Lens, size: Pair) -> Reading:
-    """The points at which a model, a layer or a view reads images of (H, W)."""
-    if len(check_lens(lens, size)) != 1:
+def reading(sample: nn.Module, lens: Lens | None, size: Pair, *, exact: bool = True) -> Reading:
+    """The points at which a model, a layer or a view reads images of (H, W).
+
+    The points of views are as exact as can be; or, without `exact`, those at which a model itself
+    reads. A polar grid is always the model's own: its samples have the bits of `polar_sample`.
+    """
+    lens = check_lens(lens, size)
+    if len(lens) != 1:
         raise ValueError(f"a plan needs one lens, got {len(lens)}")
     view = sample.view if isinstance(sample, Model) else sample
     if not isinstance(view, View):
         raise TypeError(f"sample must be a model or a view of darswin, got {type(sample).__name__}")
     channels = sample.in_chans if isinstance(sample, Model) else None
-    # A polar grid has the bits of `polar_sample`; the points of views are as exact as can be.
-    dtype = torch.float64 if isinstance(view, PixelView) else lens.theta_max.dtype
+    dtype = torch.float64 if exact and isinstance(view, PixelView) else lens.theta_max.dtype
     points = view.prepare(lens.to("cpu", dtype), size, back=False, rays=False).points
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
