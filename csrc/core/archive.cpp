@@ -1,12 +1,12 @@
 #include "archive.h"
 
 #include <fcntl.h>
-#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <cerrno>
 #include <charconv>
 #include <cstring>
 #include <new>
@@ -60,18 +60,14 @@ class File {
   explicit File(const std::string& path) {
     // Without O_NONBLOCK, a pipe would wait for its other end.
     descriptor = open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK);
-    struct stat facts;
-    if (descriptor < 0 || fstat(descriptor, &facts) != 0) fail();
-    if (S_ISDIR(facts.st_mode)) fail(EISDIR);
-    if (!S_ISREG(facts.st_mode)) {
+    if (descriptor < 0) throw std::system_error(errno, std::generic_category());
+    size = lseek(descriptor, 0, SEEK_END);
+    if (size < 0) {
       close(descriptor);
       throw std::invalid_argument("it is a pipe, a socket or a device");
     }
-    size = facts.st_size;
   }
-  ~File() {
-    if (descriptor >= 0) close(descriptor);
-  }
+  ~File() { close(descriptor); }
   File(const File&) = delete;
 
   void read(int64_t offset, void* to, int64_t bytes) const {
@@ -95,11 +91,7 @@ class File {
   int64_t size = 0;
 
  private:
-  [[noreturn]] void fail(int error = errno) {
-    if (descriptor >= 0) close(descriptor);
-    throw std::system_error(error, std::generic_category());
-  }
-  int descriptor = -1;
+  int descriptor;
 };
 
 // A number of a header.
