@@ -45,7 +45,7 @@ class CMakeBuild(build_ext):
             )
         output = Path(self.get_ext_fullpath("darswin.libdarswin")).resolve().parent
         sanitize = os.environ.get("DARSWIN_SANITIZE", "")
-        build = ROOT / "build" / ("cmake-sanitized" if sanitize else "cmake")
+        build = ROOT / "build" / os.environ.get("DARSWIN_BUILD", "cmake")
         subprocess.check_call(
             ["cmake", "--log-level=NOTICE", "-S", ROOT, "-B", build, "-G", "Ninja",
              f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja')}",

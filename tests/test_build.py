@@ -94,8 +94,7 @@ def test_tiers_can_be_forced_and_agree():
 
 def test_build_info():
     info = _module.build_info()
-    assert info["cxx_standard"] >= 202002 and info["openmp"] >= 201511
-    assert "stable" in info["torch_abi"]
+    assert info["cxx_standard"] >= 202002 and "stable" in info["torch_abi"]
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +125,7 @@ def test_no_inline_function_leaks_from_a_tier(optimized, request):
     Where code is optimized, such a function may have been inlined; so all is also compiled without.
     """
     root = ROOT if optimized else request.getfixturevalue("unpacked")
-    build = root / "build" / "cmake"
+    build = root / "build" / os.environ.get("DARSWIN_BUILD", "cmake")
     commands = json.loads((build / "compile_commands.json").read_text())
     kernels = [command for command in commands if "/kernels/" in command["file"]]
     assert all((" -O3 " in command["command"]) == optimized for command in kernels)
@@ -168,7 +167,7 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
     assert any("libtorch_cpu.so" in line for line in needed) == (path != FRAMES)
-    assert any("libgomp" in line for line in needed) == (path != FRAMES)
+    assert not any("omp" in line for line in needed)
     assert not any("/" in line.split("[")[1] for line in needed)
 
 
@@ -184,8 +183,10 @@ def test_the_modules_export_no_more_than_needed():
 
 @BOTH
 def test_the_modules_ask_for_nothing_newer_than_manylinux_2_28(path):
-    major = int(re.search(r"g\+\+ (\d+)", _module.build_info()["compiler"])[1])
-    if major > 12:
+    compiler, version = _module.build_info()["compiler"].split()[:2]
+    if compiler == "clang++":  # it uses the headers of g++
+        version = output("g++", "-dumpversion")
+    if int(version.split(".")[0]) > 12:
         pytest.skip("headers of a newer compiler may ask for more: use the container")
     newest = {"GLIBC": (2, 28), "GLIBCXX": (3, 4, 24), "CXXABI": (1, 3, 11)}
     shown = output("readelf", "-V", path)
@@ -244,9 +245,13 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_pa
         "import torch, darswin; print(darswin.__file__, darswin.ops._module.FILE);"
         "lens = darswin.lens.Spherical.from_fov(0.4, 2.6, 16.0);"
         "model = darswin.create_model('darswin_a_nano', num_classes=3);"
-        "print(model(torch.zeros(1, 3, 32, 32), lens).shape)"
+        "print(model(torch.zeros(1, 3, 32, 32), lens).shape)\n"
+        # An exception of a module whose functions the compiler has not inlined.
+        "try: darswin.frames._frames.polar_places([], [], [], None, None, (2, 2))\n"
+        "except ValueError as error: print(error)"
     )
     out = output(sys.executable, "-c", code, cwd=tmp_path, env={"PYTHONPATH": str(elsewhere)})
     assert out.count(str(elsewhere)) == 2 and "torch.Size([1, 3])" in out
+    assert "the arrays of the grid do not fit together" in out
     assert (elsewhere / "darswin" / "train" / "presets" / "iccv2023.yaml").is_file()
     assert (elsewhere / "bin" / "darswin").is_file()

@@ -28,7 +28,8 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
   } else {
     args.out = static_cast<float*>(out);
   }
-  const auto& kernel = kernels<LinearKernels<X>>().rows;
+  const auto& table = kernels<LinearKernels<X>>();
+  const auto kernel = table.by_fours != nullptr && has_fours() ? table.by_fours : table.rows;
   constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
   // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
   constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
@@ -75,10 +76,6 @@ Layer::Layer(const void* packed_, int64_t depth_, int64_t columns_, bool is_quan
   const auto* last = static_cast<const int32_t*>(packed) + words(depth, columns, true) - kLastWords;
   scale = std::bit_cast<float>(last[0]);
   quantizer = {std::bit_cast<float>(last[1]), last[2]};
-}
-
-bool has_quantized_layers() {
-  return kernels<LinearKernels<uint8_t>>().rows != nullptr && cpu_has_vnni();
 }
 
 void multiply(const void* x, int64_t rows, const Layer& layer, void* out, After after,

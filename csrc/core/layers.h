@@ -24,9 +24,6 @@ struct Layer {
   static int64_t words(int64_t depth, int64_t columns, bool is_quantized);
 };
 
-// Returns true if this tier and this CPU have products of 8 bits.
-bool has_quantized_layers();
-
 // A layer norm: its weight, then its bias, of `dim` numbers each.
 struct Norm {
   const float* parameters = nullptr;

@@ -129,7 +129,6 @@ Layer Network::layer_at(int64_t offset, int64_t depth, int64_t columns,
           "has an empty layer");
   product({depth + kPanelUnit, columns + kPanelUnit, 4});
   require(is_quantized == 0 || depth <= kMostDepth, "has a sum that does not fit 32 bits");
-  require(is_quantized == 0 || has_quantized_layers(), "needs products of 8 bits of this CPU");
   const int64_t count = Layer::words(depth, columns, is_quantized == 1);
   require(offset >= 0 && offset <= words && count <= words - offset, "reads beyond its weights");
   return Layer(weights + offset, depth, columns, is_quantized == 1);

@@ -10,6 +10,17 @@
 namespace darswin {
 namespace {
 
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, kLanes<float>> v) {
+  if constexpr (kRegister == 64) {
+    store_bits(to, __builtin_convertvector(v, Vector<uint8_t, kLanes<float>>));
+  } else {  // the compiler's own conversion takes one number at a time
+    auto bytes = (Vector<uint8_t, kRegister>)v;
+    bytes = evens(bytes, bytes);
+    bytes = evens(bytes, bytes);
+    __builtin_memcpy(to, &bytes, kLanes<float>);
+  }
+}
+
 // Works on one float or on a register, Floats.
 class Quantize {
  public:
@@ -29,7 +40,7 @@ class Quantize {
     if constexpr (is_same_v<V, float>) {
       *to = static_cast<uint8_t>(bits);
     } else {
-      store_bits(to, __builtin_convertvector(bits, Vector<uint8_t, kLanes<float>>));
+      store_lowest_bytes(to, bits);
     }
   }
   void operator()(uint8_t* to, const float* from, int64_t count) const {

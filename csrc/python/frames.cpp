@@ -1,5 +1,5 @@
 // The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use
-// torch, and OpenMP neither, whose library a system without torch may lack.
+// torch.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>

@@ -5,29 +5,25 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from darswin.deploy.packed import OwnBlocks, OwnLinear, OwnNorm, own_operator, refuse_gradients
-from darswin.deploy.program import (
-    NoProgramError,
-    Program,
-    Slot,
-    Weights,
-    carried,
-    encoder_maps,
-    own,
-    refined,
-)
+from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastStage
+from darswin.deploy.own import OwnLinear, OwnNorm, pack
+from darswin.deploy.packed import InDtype, OwnBlocks, refuse_gradients
+from darswin.deploy.program import AND_GELU, NOTHING, RUN, Program, Slot, Weights
+from darswin.layers.embed import PatchEmbed
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
-from darswin.models.pixel import RAYS, DistanceHead
-from darswin.models.unet import Unet
+from darswin.models.pixel import RAYS, DistanceHead, PixelHead
+from darswin.models.unet import PatchExpand, Unet
 from darswin.views import PixelGrid, PolarView, Prepared
 from darswin.views.base import Pair
 
-_RUN = own_operator("_run")
-
 Run = Callable[[Tensor, Prepared, Tensor | None], Any]
+
+
+class NoProgramError(TypeError):
+    """The model has a part that is no instruction."""
 
 
 def compiled(model: Model) -> Run | None:
@@ -49,12 +45,13 @@ class _EncoderRun:
         tables = _tables(program, model)
         for slot in _results(program, model, seen, tables):
             program.output(slot)
-        self.words, self.weights = program.words(), weights.join()
+        _share(model, weights)
+        self.words, self.weights = program.words(), weights.words
         self.is_list = isinstance(model, FeatureMaps)
 
     def __call__(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
         refuse_gradients(x)
-        outputs = _RUN([x.float(), *chain(*prepared.tables)], self.weights, self.words)
+        outputs = RUN([x.float(), *chain(*prepared.tables)], self.weights, self.words)
         return outputs if self.is_list else outputs[0]
 
 
@@ -78,7 +75,8 @@ class _UnetRun:
         self.heads: dict[Pair, list[int]] = {}  # the program of the head, by the size of the images
         if unet.refines_with_images:
             self._of_head((4, 4))  # its weights
-        self.weights = self.shared.join()
+        _share(unet, self.shared)
+        self.weights = self.shared.words
 
     def _of_head(self, size: Pair) -> list[int]:
         if size not in self.heads:
@@ -96,18 +94,24 @@ class _UnetRun:
         rays = [] if prepared.rays is None else [prepared.rays.float()]
         inputs = [x.float(), *chain(*prepared.tables), *_place_maps(unet, prepared)]
         if view.in_pixels:
-            (logits,) = _RUN([*inputs, *rays], self.weights, self.words)
+            (logits,) = RUN([*inputs, *rays], self.weights, self.words)
             return unet.head.finish(view.back(logits.permute(0, 3, 1, 2), prepared))
-        (maps,) = _RUN(inputs, self.weights, self.words)
+        (maps,) = RUN(inputs, self.weights, self.words)
         pixels = view.back(maps, prepared)
         if unet.refines_with_images:
             assert images is not None
             images = view.floating(images, torch.float32)
             refuse_gradients(images)
             given = [pixels.permute(0, 2, 3, 1), images.float(), *rays]
-            (logits,) = _RUN(given, self.weights, self._of_head(prepared.size))
+            (logits,) = RUN(given, self.weights, self._of_head(prepared.size))
             pixels = logits.permute(0, 3, 1, 2)
         return unet.head.finish(pixels)
+
+
+def _share(model: Model, weights: Weights) -> None:
+    """Lets the stages, which are called alone too, use the weights of the whole model."""
+    for stage in model.stages:
+        own(stage.blocks, OwnBlocks).weights = weights
 
 
 class FrameProgram(NamedTuple):
@@ -161,7 +165,7 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
         program.output(slot)
     constants = [one.detach().float()[0].contiguous() for one in constants]
     classifier = isinstance(model, Encoder) and model.num_classes > 0
-    return FrameProgram(program.words(), program.weights.join(), constants, reads_frame, classifier)
+    return FrameProgram(program.words(), program.weights.words, constants, reads_frame, classifier)
 
 
 def _back(
@@ -220,8 +224,7 @@ def _tables(program: Program, model: Model) -> list[list[Slot]]:
     tables = []
     for stage in model.stages:
         blocks = own(stage.blocks, OwnBlocks)
-        sizes = [[2 * reach - 1 for reach in windows[:2]] for windows in blocks.windows]
-        tables.append([program.input(blocks.heads, *size) for size in sizes])
+        tables.append([program.input(*shape) for shape in blocks.table_shapes])
     return tables
 
 
@@ -240,3 +243,108 @@ def _place_maps(unet: Unet, prepared: Prepared) -> list[Tensor]:
     layers: list[Any] = list(unet.places)
     steps = zip(layers, prepared.tokens, strict=bool(layers))
     return [layer(place.to(layer.weight)) for layer, place in steps]
+
+
+def own(layer: Any, kind: type) -> Any:
+    """The layer of our own in an optimized layer."""
+    if isinstance(layer, FastLayer):
+        layer = layer.layer
+    if not isinstance(layer, kind):
+        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
+    return layer
+
+
+def embedded(program: Program, embed: nn.Module, x: Slot) -> Slot:
+    """What the view sees → the first map."""
+    if isinstance(embed, FastEmbed):
+        return program.norm(program.linear(x, own(embed.proj, OwnLinear)), own(embed.norm, OwnNorm))
+    if not (isinstance(embed, InDtype) and isinstance(embed.module, PatchEmbed)):
+        raise NoProgramError(f"{type(embed).__name__} is no instruction of a network's program")
+    conv, (channels, height, width) = embed.module.proj, x.shape
+    side = conv.kernel_size[0]
+    rows, columns = height // side, width // side
+    patches = program.permuted(
+        x, (channels, rows, side, columns, side), (1, 3, 0, 2, 4), rows, columns,
+        channels * side * side,
+    )  # fmt: skip
+    layer = OwnLinear(pack(conv.weight.flatten(1), conv.bias), conv.out_channels)
+    return program.norm(program.linear(patches, layer), OwnNorm(embed.module.norm))
+
+
+def stage(program: Program, layer: nn.Module, x: Slot, tables: Sequence[Slot]) -> Slot:
+    """The map of the previous stage → the map of this one."""
+    if not isinstance(layer, FastStage):
+        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
+    if isinstance(layer.downsample, FastMerging):
+        rings, sectors, dim = x.shape
+        mr, ma = layer.downsample.merge
+        x = program.permuted(
+            x, (rings // mr, mr, sectors // ma, ma, dim), (0, 2, 3, 1, 4),
+            rings // mr, sectors // ma, mr * ma * dim,
+        )  # fmt: skip
+        x = program.linear(x, own(layer.downsample.product, OwnLinear))
+    elif not isinstance(layer.downsample, nn.Identity):
+        raise NoProgramError(f"{type(layer.downsample).__name__} is no instruction of a program")
+    program.blocks(x, own(layer.blocks, OwnBlocks), tables)
+    return x
+
+
+def encoder_maps(
+    program: Program, encoder: Encoder, x: Slot, tables: Sequence[Sequence[Slot]]
+) -> list[Slot]:
+    """The maps after each stage, as `Encoder.maps`. The stages change no earlier map."""
+    x = embedded(program, encoder.patch_embed, x)
+    maps = []
+    for layer, of_stage in zip(encoder.stages, tables, strict=False):
+        x = stage(program, layer, x, of_stage)
+        maps.append(x)
+    return maps
+
+
+def expanded(program: Program, x: Slot, layer: PatchExpand, after: Any = None) -> Slot:
+    """Tokens split as in `PatchExpand`, each followed by a linear layer if one is given."""
+    rings, sectors, _ = x.shape
+    mr, ma = layer.split
+    x = program.linear(x, own(layer.expansion, OwnLinear))
+    x = x._replace(shape=(rings * sectors * ma * mr, layer.out_dim))
+    x = program.norm(x, own(layer.norm, OwnNorm))
+    if after is not None:
+        x = program.linear(x, own(after, OwnLinear))
+    width = x.shape[-1]
+    return program.permuted(
+        x, (rings, sectors, ma, mr, width), (0, 3, 1, 2, 4), rings * mr, sectors * ma, width
+    )
+
+
+def carried(
+    program: Program, unet: Unet, x: Slot, tables: Sequence[Sequence[Slot]], places: Sequence[Slot]
+) -> Slot:
+    """What the view sees → the channels that are resampled to the pixels."""
+    encoder, decoder, head = unet.encoder, unet.decoder, unet.head
+    maps = encoder_maps(program, encoder, x, tables)
+    maps[-1] = program.norm(maps[-1], own(encoder.norm, OwnNorm), program.buffer(*maps[-1].shape))
+    for slot, place in zip(maps, places, strict=bool(places)):
+        program.added(place, slot)
+    x, of_decoder = maps[-1], tables[len(maps) :]
+    joins: list[Any] = list(decoder.joins)
+    steps = zip(joins, decoder.stages, maps[:-1], of_decoder, strict=True)
+    for join, layer, skip, of_stage in reversed(list(steps)):
+        x = program.joined(expanded(program, x, join.expand), skip)
+        x = stage(program, layer, program.linear(x, own(join.fuse, OwnLinear)), of_stage)
+    return expanded(program, x, decoder.expand, head.carry if head.skip_width else head.proj)
+
+
+def refined(program: Program, head: PixelHead, x: Slot, images: Slot | None) -> Slot:
+    """As `PixelHead.refine`, channels last."""
+    if images is None:
+        return x
+    skip = program.conv(images, _conv(head.stem), NOTHING)
+    x = program.gelu(program.added(x, skip))
+    x = program.added(program.conv(x, _conv(head.mix), AND_GELU), x)
+    return program.linear(x, own(head.proj, OwnLinear))
+
+
+def _conv(layer: Any) -> nn.Conv2d:
+    if not (isinstance(layer, InDtype) and isinstance(layer.module, nn.Conv2d)):
+        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
+    return layer.module

@@ -5,94 +5,43 @@ They are plain callables: a module would take a microsecond more for each call.
 
 import contextlib
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.deploy.own import (
+    OwnLinear,
+    OwnNorm,
+    norm_parameters,
+    own_operator,
+    packed_weights,
+    taken_by,
+)
+from darswin.deploy.program import RUN, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
-from darswin.ops import cpu_capability
 
 __all__ = ["fastest_dtype"]
 
 Layer = Callable[[Tensor], Tensor]
-# The map of a stage, which may change in place, and the position biases of its blocks → the map.
+# The map of a stage, which may change, and the position biases of its blocks → the map.
 Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 _OPS = torch.ops.darswin
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
-def own_operator(name: str) -> Callable[..., Any]:
-    """One of our operators for the CPU."""
-    # Not by way of autograd, which would look for gradients and count versions: there are none.
-    return partial(getattr(_OPS, name).default.redispatch, _CPU)
-
-
 _ADD_NORM = own_operator("_add_norm_")
 _ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
-_NORM = own_operator("_norm")
-_PACK = own_operator("_pack_linear")
-_LINEAR = own_operator("_linear")
-_BLOCKS = own_operator("_blocks_")
 
 
 def has_own_int8() -> bool:
-    """True if our own kernels compute 8-bit products here. On CPUs with AMX, oneDNN uses AMX."""
-    has_vnni = torch.cpu._is_vnni_supported() and not torch.cpu._is_amx_tile_supported()
-    return has_vnni and cpu_capability() == "avx512"
-
-
-def packed_weights(linear: Any) -> Tensor:
-    """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
-    weight = linear.weight.detach()
-    bias = None if linear.bias is None else linear.bias.detach().float()
-    if (taken := taken_by(linear)) is not None:
-        return _PACK(weight, bias, linear.weight_scale.float(), *taken)
-    return _PACK(weight.float(), bias)
-
-
-def norm_parameters(norm: nn.LayerNorm) -> Tensor:
-    """The weight and the bias of a norm, (2, D) float32."""
-    return torch.stack((norm.weight, norm.bias)).detach().float()
-
-
-def pack(weight: Tensor, bias: Tensor | None) -> Tensor:
-    """A weight (D', D) and a bias as `_linear` reads them, (K,) float32."""
-    return _PACK(weight.detach().float(), None if bias is None else bias.detach().float())
-
-
-class OwnLinear:
-    """A linear layer by our own operators, behind a norm or before a GELU if asked."""
-
-    def __init__(
-        self, packed: Tensor, columns: int, *, gelu: bool = False, norm: "OwnNorm | None" = None
-    ):
-        self.packed, self.columns, self.gelu, self.norm = packed, columns, gelu, norm
-        self._given: tuple = (packed, columns, gelu)
-        if norm is not None:
-            self._given = (*self._given, norm.parameters, norm.eps)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return _LINEAR(x, *self._given)
-
-
-class OwnNorm:
-    """A layer norm by our own operators."""
-
-    def __init__(self, norm: nn.LayerNorm):
-        self.eps = norm.eps
-        eps = torch.tensor([norm.eps])
-        # As the programs of networks have it: the weight, the bias and eps.
-        self.words = torch.cat((norm_parameters(norm).flatten(), eps))
-        self.parameters = norm_parameters(norm)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return _NORM(x, self.parameters, self.eps)
+    """True if our own kernels compute 8-bit products here: not where oneDNN uses AMX."""
+    return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
 class OwnBlocks:
@@ -115,21 +64,30 @@ class OwnBlocks:
         self.windows: list[list[int]] = [
             [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
         ]
-        self.heads, self.mlp_dim = blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features
-        parameters = [
-            part.parameters if isinstance(part, OwnNorm) else part
-            for layers in self.layers
-            for part in layers
-        ]
-        windows = [number for of_block in self.windows for number in of_block]
-        # Of `_blocks_`, all but the map and the position biases.
-        self.arguments = parameters, windows, self.heads, self.mlp_dim, blocks[0].norm1.eps
+        attn = blocks[0].attn
+        self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
+        self.map_shape = (*attn.map_size, attn.dim)
+        self.weights = Weights()  # or those of a whole model
+
+    @cached_property
+    def words(self) -> list[int]:
+        """The program of these blocks alone: a map and the position biases → the map."""
+        program = Program(self.weights)
+        x = program.input(*self.map_shape)
+        tables = [program.input(*shape) for shape in self.table_shapes]
+        out = program.permuted(x, self.map_shape, (0, 1, 2), *self.map_shape)
+        program.blocks(out, self, tables)
+        program.output(out)
+        return program.words()
+
+    @property
+    def table_shapes(self) -> list[tuple[int, int, int]]:
+        """The shape of the position bias of each block."""
+        return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]
 
     def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-        x = x.contiguous()
-        parameters, *given = self.arguments
-        _BLOCKS(x, parameters, tables, *given)
-        return x
+        words = self.words
+        return RUN([x, *tables], self.weights.words, words)[0]
 
 
 class Own:
@@ -254,11 +212,6 @@ def library(layer: nn.Module, dtype: torch.dtype) -> Own:
     """The library that computes a layer, or a part of a model, fastest here."""
     own = dtype == torch.float32 and (not quantized_layers(layer) or has_own_int8())
     return Own() if own else OneDNN(dtype)
-
-
-def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
-    """The quantization of what the layer with this name takes; None if it is not quantized."""
-    return quantized_layers(module).get(name)
 
 
 def _has_windows(attn: nn.Module) -> bool:

@@ -1,27 +1,23 @@
-"""Programs of whole networks: the instructions of csrc/core/network.h, from the layers of an
-optimized model."""
+"""Programs of networks: the instructions of csrc/core/network.h."""
 
 import struct
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastStage
-from darswin.deploy.packed import InDtype, OwnBlocks, OwnLinear, OwnNorm, pack
-from darswin.layers.embed import PatchEmbed
-from darswin.models.encoder import Encoder
-from darswin.models.pixel import PixelHead
-from darswin.models.unet import PatchExpand, Unet
+from darswin.deploy.own import OwnLinear, OwnNorm, own_operator, pack
+
+if TYPE_CHECKING:
+    from darswin.deploy.packed import OwnBlocks
+
+RUN = own_operator("_run")
 
 LINEAR, NORM, BLOCK, COPY, ADD, MEAN, GELU, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE = range(12)
-_NOTHING, _GELU, _ADD = range(3)  # what follows a product
-
-
-class NoProgramError(TypeError):
-    """The model has a part that is no instruction."""
+NOTHING, AND_GELU, AND_ADD = range(3)  # what follows a product
 
 
 class Slot(NamedTuple):
@@ -61,13 +57,16 @@ class Weights:
     def offset(self, piece: Tensor) -> int:
         """The place of packed words of 32 bits, which are added if they are new."""
         if id(piece) not in self._offsets:
+            assert "words" not in vars(self), "a piece is new to weights that are joined already"
             self._offsets[id(piece)] = self._count
             self._pieces.append(piece)
             self._count += piece.numel()
         return self._offsets[id(piece)]
 
-    def join(self) -> Tensor:
-        """All words, (K,) int32. The pieces become views of them, so they take no memory twice."""
+    @cached_property
+    def words(self) -> Tensor:
+        """All words, (K,) int32. Nothing new is added after. The pieces become views of them, so
+        they take no memory twice."""
         pieces = [piece.flatten().view(torch.int32) for piece in self._pieces]
         words = torch.cat(pieces)
         for piece in self._pieces:
@@ -140,7 +139,7 @@ class Program:
     def _norm_offset(self, norm: OwnNorm) -> int:
         return self.weights.offset(norm.words)
 
-    def blocks(self, x: Slot, blocks: OwnBlocks, tables: Sequence[Slot]) -> None:
+    def blocks(self, x: Slot, blocks: "OwnBlocks", tables: Sequence[Slot]) -> None:
         """The blocks of a stage, in place."""
         rings, sectors, dim = x.shape
         steps = zip(blocks.layers, blocks.windows, tables, strict=True)
@@ -219,7 +218,7 @@ class Program:
         return x
 
     def conv(self, x: Slot, layer: nn.Conv2d, after: int, out: Slot | None = None) -> Slot:
-        """A convolution of 3 × 3; after `_ADD` it is added to `out`."""
+        """A convolution of 3 × 3; after `AND_ADD` it is added to `out`."""
         height, width, channels = x.shape
         out = out or self.buffer(height, width, layer.out_channels)
         self._step(
@@ -262,108 +261,3 @@ def _strides(sizes: Sequence[int]) -> list[int]:
     for size in reversed(sizes[1:]):
         strides.insert(0, strides[0] * size)
     return strides
-
-
-def own(layer: Any, kind: type) -> Any:
-    """The layer of our own in an optimized layer."""
-    if isinstance(layer, FastLayer):
-        layer = layer.layer
-    if not isinstance(layer, kind):
-        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
-    return layer
-
-
-def embedded(program: Program, embed: nn.Module, x: Slot) -> Slot:
-    """What the view sees → the first map."""
-    if isinstance(embed, FastEmbed):
-        return program.norm(program.linear(x, own(embed.proj, OwnLinear)), own(embed.norm, OwnNorm))
-    if not (isinstance(embed, InDtype) and isinstance(embed.module, PatchEmbed)):
-        raise NoProgramError(f"{type(embed).__name__} is no instruction of a network's program")
-    conv, (channels, height, width) = embed.module.proj, x.shape
-    side = conv.kernel_size[0]
-    rows, columns = height // side, width // side
-    patches = program.permuted(
-        x, (channels, rows, side, columns, side), (1, 3, 0, 2, 4), rows, columns,
-        channels * side * side,
-    )  # fmt: skip
-    layer = OwnLinear(pack(conv.weight.flatten(1), conv.bias), conv.out_channels)
-    return program.norm(program.linear(patches, layer), OwnNorm(embed.module.norm))
-
-
-def stage(program: Program, layer: nn.Module, x: Slot, tables: Sequence[Slot]) -> Slot:
-    """The map of the previous stage → the map of this one."""
-    if not isinstance(layer, FastStage):
-        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
-    if isinstance(layer.downsample, FastMerging):
-        rings, sectors, dim = x.shape
-        mr, ma = layer.downsample.merge
-        x = program.permuted(
-            x, (rings // mr, mr, sectors // ma, ma, dim), (0, 2, 3, 1, 4),
-            rings // mr, sectors // ma, mr * ma * dim,
-        )  # fmt: skip
-        x = program.linear(x, own(layer.downsample.product, OwnLinear))
-    elif not isinstance(layer.downsample, nn.Identity):
-        raise NoProgramError(f"{type(layer.downsample).__name__} is no instruction of a program")
-    program.blocks(x, own(layer.blocks, OwnBlocks), tables)
-    return x
-
-
-def encoder_maps(
-    program: Program, encoder: Encoder, x: Slot, tables: Sequence[Sequence[Slot]]
-) -> list[Slot]:
-    """The maps after each stage, as `Encoder.maps`. The stages change no earlier map."""
-    x = embedded(program, encoder.patch_embed, x)
-    maps = []
-    for layer, of_stage in zip(encoder.stages, tables, strict=False):
-        x = stage(program, layer, x, of_stage)
-        maps.append(x)
-    return maps
-
-
-def expanded(program: Program, x: Slot, layer: PatchExpand, after: Any = None) -> Slot:
-    """Tokens split as in `PatchExpand`, each followed by a linear layer if one is given."""
-    rings, sectors, _ = x.shape
-    mr, ma = layer.split
-    x = program.linear(x, own(layer.expansion, OwnLinear))
-    x = x._replace(shape=(rings * sectors * ma * mr, layer.out_dim))
-    x = program.norm(x, own(layer.norm, OwnNorm))
-    if after is not None:
-        x = program.linear(x, own(after, OwnLinear))
-    width = x.shape[-1]
-    return program.permuted(
-        x, (rings, sectors, ma, mr, width), (0, 3, 1, 2, 4), rings * mr, sectors * ma, width
-    )
-
-
-def carried(
-    program: Program, unet: Unet, x: Slot, tables: Sequence[Sequence[Slot]], places: Sequence[Slot]
-) -> Slot:
-    """What the view sees → the channels that are resampled to the pixels."""
-    encoder, decoder, head = unet.encoder, unet.decoder, unet.head
-    maps = encoder_maps(program, encoder, x, tables)
-    maps[-1] = program.norm(maps[-1], own(encoder.norm, OwnNorm), program.buffer(*maps[-1].shape))
-    for slot, place in zip(maps, places, strict=bool(places)):
-        program.added(place, slot)
-    x, of_decoder = maps[-1], tables[len(maps) :]
-    joins: list[Any] = list(decoder.joins)
-    steps = zip(joins, decoder.stages, maps[:-1], of_decoder, strict=True)
-    for join, layer, skip, of_stage in reversed(list(steps)):
-        x = program.joined(expanded(program, x, join.expand), skip)
-        x = stage(program, layer, program.linear(x, own(join.fuse, OwnLinear)), of_stage)
-    return expanded(program, x, decoder.expand, head.carry if head.skip_width else head.proj)
-
-
-def refined(program: Program, head: PixelHead, x: Slot, images: Slot | None) -> Slot:
-    """As `PixelHead.refine`, channels last."""
-    if images is None:
-        return x
-    skip = program.conv(images, _conv(head.stem), _NOTHING)
-    x = program.gelu(program.added(x, skip))
-    x = program.added(program.conv(x, _conv(head.mix), _GELU), x)
-    return program.linear(x, own(head.proj, OwnLinear))
-
-
-def _conv(layer: Any) -> nn.Conv2d:
-    if not (isinstance(layer, InDtype) and isinstance(layer.module, nn.Conv2d)):
-        raise NoProgramError(f"{type(layer).__name__} is no instruction of a network's program")
-    return layer.module

@@ -7,7 +7,7 @@ import ctypes
 import json
 from pathlib import Path
 
-import torch  # before the module: both must share the libgomp that torch loads
+import torch
 
 FILE = Path(__file__).parent.parent / "libdarswin.so"
 
@@ -36,6 +36,8 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_allow_fours.argtypes = [ctypes.c_bool]
+    module.darswin_allow_fours.restype = ctypes.c_bool
     return module
 
 
@@ -61,8 +63,17 @@ def set_tier(tier: str) -> None:
         )
 
 
+def allow_fours(allowed: bool) -> bool:
+    """Says whether 8-bit layers may use instructions for four bytes at a time, such as VNNI.
+
+    They may at first. The results are the same. Returns True if the CPU and the tier have them, and
+    they are allowed.
+    """
+    return _loaded.darswin_allow_fours(allowed)
+
+
 def build_info() -> dict[str, str | int]:
-    """Facts about the module's build: compiler, cxx_standard, openmp, torch_abi."""
+    """Facts about the module's build: compiler, cxx_standard, torch_abi."""
     return json.loads(_loaded.darswin_build_info())
 
 

@@ -20,10 +20,10 @@ LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 @torch.no_grad()
 @pytest.mark.parametrize("lenses", [slice(0, 1), slice(0, 5)])
 def test_large_batches_go_in_parts(monkeypatch, lenses):
-    model, images = network("dat_nano"), torch.randn(5, 3, 32, 32)
+    model, images = network("darswin_a_nano"), torch.randn(5, 3, 32, 32)
     lens = Spherical.from_fov([0.0, 0.2, 0.5, 0.7, 0.9], math.radians(160), 16.0)[lenses]
     want = model(images, lens)
-    image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
+    image = 256 * 4 * 24 * 2  # bytes of a hidden map of the first stage
     sizes = []
 
     def counted(run):
@@ -35,11 +35,11 @@ def test_large_batches_go_in_parts(monkeypatch, lenses):
 
     for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
         monkeypatch.setattr("darswin.deploy.fast.CACHED_BYTES", most)
-        fast = optimize(model)
+        fast = optimize(model, torch.bfloat16)
         for stage in fast.stages:
             stage.blocks = counted(stage.blocks)
         sizes.clear()
-        assert relative_error(fast(images, lens), want) < 1e-5
+        assert relative_error(fast(images, lens), want) < 0.05
         assert sizes[: len(parts)] == parts
         assert fast(images[:0], lens[:0] if len(lens) > 1 else lens).shape == (0, 5)
 
