@@ -27,19 +27,13 @@ namespace {
 using Clock = std::chrono::steady_clock;
 using Microseconds = std::chrono::duration<double, std::micro>;
 
-int env(const char* n, int d) {
-  const char* v = getenv(n);
-  return v ? atoi(v) : d;
-}
-
-// A helper that comes late finds work if there are several chunks for each thread. But a chunk
-// should not be short, because many kernels prepare something for each.
-const double kChunks = env("D_CHUNKS", 4);
-const double kChunkTime = env("D_CHUNKT", 200);
+// Several chunks for each thread leave work for a helper that comes late. But chunks should not be
+// short, because many kernels prepare something for each.
+constexpr double kChunks = 4, kChunkTime = 200;  // at most; at least, in microseconds
 constexpr int64_t kMostHelpers = 1023, kSlices = 64;
 constexpr int kJobs = 16;  // of several callers at once; further calls work alone
-const Microseconds kLeastAwake{env("D_LEAST", 6)}, kMostAwake{env("D_AWAKE", 100)};
-const double kWorthWaking = env("D_WORTH", 100);
+constexpr Microseconds kLeastAwake{6}, kMostAwake{100};
+constexpr double kWorthWaking = 100;  // microseconds of work
 
 // The end of the first k of so many contiguous parts of [0, count).
 int64_t share(int64_t count, int64_t parts, int64_t k) {

@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
+#include <limits>
 #include <memory>
 #include <new>
 #include <type_traits>
@@ -93,16 +94,16 @@ class ThreadLimit {
   int64_t before;
 };
 
-// The number of threads of a call, and about how long a single one would take.
+// The number of threads of a call, and about how long one thread alone would take.
 struct Threads {
   int64_t count;
-  double microseconds;
-  Threads(int64_t count, double microseconds = 1e300) : count(count), microseconds(microseconds) {}
+  double microseconds = std::numeric_limits<double>::max();
+
   operator int64_t() const { return count; }
 };
 
-// Returns the number of threads that is worth starting for so many microseconds of work. The second
-// thread takes about two microseconds to begin, and more if it has fallen asleep.
+// Returns the number of threads that is worth using for so many microseconds of work. A helper that
+// is awake takes about a microsecond to begin. parallel.cpp decides whether to wake one.
 inline Threads threads_for(double microseconds) {
   constexpr double kLeast = 10;  // microseconds for each thread
   const double most = std::max(microseconds / kLeast, 1.0);
@@ -118,13 +119,13 @@ inline double sampling_microseconds(double count, int64_t channels) {
   return count * static_cast<double>(channels + 4) / kPerMicrosecond;
 }
 
-// Calls body(context, begin, end) on contiguous ranges that cover [0, count), in this thread and in
-// helpers (parallel.cpp). Ranges depend on `threads`, and several may be run by one thread.
+// Calls body(context, begin, end) as parallel_ranges does.
 using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
 void run_ranges(int64_t count, Threads threads, RangeBody body, void* context);
 
-// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. The
-// first exception of a range is thrown again, when all ranges that began have ended.
+// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. A
+// thread may take several ranges. The first exception of a range is thrown again when all ranges
+// that began have ended; further ones need not begin.
 template <typename Body>
 void parallel_ranges(int64_t count, Threads threads, Body&& body) {
   if (count <= 0) return;
@@ -133,10 +134,6 @@ void parallel_ranges(int64_t count, Threads threads, Body&& body) {
     (*static_cast<std::remove_reference_t<Body>*>(context))(begin, end);
   };
   run_ranges(count, threads, call, const_cast<void*>(static_cast<const void*>(&body)));
-}
-template <typename Body>
-void parallel_ranges(int64_t count, Body&& body) {
-  parallel_ranges(count, num_threads(), std::forward<Body>(body));
 }
 
 // Calls body(begin, end, scratch) in the same way. Each thread gets `bytes` of working memory.

@@ -27,7 +27,7 @@ void check(bool holds, const char* what) {
 // Each item is done once, by plain writes that the caller reads afterwards.
 void fill(int64_t count, int64_t threads) {
   std::vector<int64_t> items(count);
-  run_with_scratch(count, threads, 64, [&](int64_t begin, int64_t end, void* scratch) {
+  run_with_scratch(count, Threads{threads}, 64, [&](int64_t begin, int64_t end, void* scratch) {
     check(begin < end && end <= count, "a range");
     if (!calls) ++helped;
     auto& sum = *static_cast<int64_t*>(scratch);
@@ -38,10 +38,11 @@ void fill(int64_t count, int64_t threads) {
 
 void nest(int64_t count, int64_t threads) {
   std::vector<int64_t> sums(count);
-  parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {
+  parallel_ranges(count, Threads{threads}, [&](int64_t begin, int64_t end) {
     for (int64_t k = begin; k < end; ++k) {
       std::atomic<int64_t> sum{0};
-      parallel_ranges(k, threads, [&](int64_t first, int64_t last) { sum += last - first; });
+      parallel_ranges(k, Threads{threads},
+                      [&](int64_t first, int64_t last) { sum += last - first; });
       sums[k] = sum;
     }
   });
@@ -52,7 +53,7 @@ void fail(int64_t count, int64_t threads) {
   std::vector<int64_t> items(count);
   bool caught = false;
   try {
-    parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {
+    parallel_ranges(count, Threads{threads}, [&](int64_t begin, int64_t end) {
       for (int64_t k = begin; k < end; ++k) items[k] = k;
       if (end == count) throw std::runtime_error("the last range");
     });
