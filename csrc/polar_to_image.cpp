@@ -104,7 +104,7 @@ struct ToImageCall {
     return {args.batch, args.channels, args.height, args.width};
   }
 
-  int64_t threads() const { return polar_to_image_threads(args); }
+  Threads threads() const { return polar_to_image_threads(args); }
 
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {

@@ -34,7 +34,7 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
   // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
   constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
   const double work = static_cast<double>(rows) * depth * columns;
-  const int64_t threads = threads_for(work / kPerMicrosecond);
+  const Threads threads = threads_for(work / kPerMicrosecond);
   const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
@@ -57,7 +57,7 @@ void normalize_rows(const float* x, int64_t rows, const Norm& norm, Out* out, Qu
                                      .width = norm.dim,
                                      .quantizer = quantizer};
   constexpr double kPerMicrosecond = 4000;  // numbers
-  const int64_t threads = threads_for(static_cast<double>(rows) * norm.dim / kPerMicrosecond);
+  const Threads threads = threads_for(static_cast<double>(rows) * norm.dim / kPerMicrosecond);
   parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
     kernels<AddNormKernels<float, Out>>().rows(args, begin, end);
   });

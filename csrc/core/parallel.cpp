@@ -1,10 +1,10 @@
 // A pool of helper threads. No call waits for a thread that has not begun.
 //
-// A call publishes a job: its work in chunks. Its own thread takes chunk after chunk, and helpers
-// that are awake do so too. When no chunk is left, the call only waits for the chunks that helpers
-// have begun. A helper that finds no work stays awake for a short time, because the next job of a
-// network follows at once, and then it sleeps. A call wakes at most one helper, which wakes the
-// next.
+// A call publishes a job, whose work is cut into chunks. The calling thread takes chunk after
+// chunk, and so do helpers that are awake. When no chunk is left, the call only waits for chunks
+// that helpers have begun. A helper without work stays awake for some microseconds, because the
+// next job of a network follows at once, and then it sleeps. A call wakes at most one helper, and
+// only for enough work; this helper wakes the next one.
 #include "parallel.h"
 
 #include <pthread.h>
@@ -24,13 +24,24 @@
 namespace darswin {
 namespace {
 
-constexpr int64_t kChunks = 2;  // for each thread, so that one that comes late finds work
-constexpr int64_t kMostHelpers = 1023;
-constexpr int kJobs = 16;  // of several callers at once; further ones work alone
-constexpr std::chrono::microseconds kAwake{50};
+using Clock = std::chrono::steady_clock;
+using Microseconds = std::chrono::duration<double, std::micro>;
 
-// A job belongs to the call that has `taken` it. Others may touch its fields only while `state`
-// counts them as helpers. They join while there are free seats. A job without free seats is closed.
+// Several chunks for each thread leave work for a helper that comes late. But chunks should not be
+// short, because many kernels prepare something for each.
+constexpr double kChunks = 4, kChunkTime = 200;  // at most; at least, in microseconds
+constexpr int64_t kMostHelpers = 1023, kSlices = 64;
+constexpr int kJobs = 16;  // of several callers at once; further calls work alone
+constexpr Microseconds kLeastAwake{6}, kMostAwake{100};
+constexpr double kWorthWaking = 100;  // microseconds of work
+
+// The end of the first k of so many contiguous parts of [0, count).
+int64_t share(int64_t count, int64_t parts, int64_t k) {
+  return count / parts * k + std::min(count % parts, k);
+}
+
+// A job belongs to the call that has `taken` it. A helper may touch its fields only while `state`
+// counts this helper. It joins while there are free seats; a job without free seats is closed.
 struct alignas(64) Job {
   std::atomic<bool> taken{false};
   std::atomic<uint64_t> state{0};  // free seats * kSeat + helpers at work
@@ -39,7 +50,10 @@ struct alignas(64) Job {
   void* context = nullptr;
   std::exception_ptr* failure = nullptr;
   std::atomic<bool> failed{false};
-  alignas(64) std::atomic<int64_t> next{0};
+  int64_t slices = 0;  // of the chunks, one for each thread
+  struct alignas(64) Slice {
+    std::atomic<int64_t> next{0};  // the first chunk that nobody has begun
+  } slice[kSlices];
 
   static constexpr uint64_t kSeat = uint64_t{1} << 32;
 
@@ -50,42 +64,51 @@ struct alignas(64) Job {
     }
     return false;
   }
+  bool has_seats() const { return state.load(std::memory_order_relaxed) >= kSeat; }
+  void close() { state.fetch_and(kSeat - 1, std::memory_order_relaxed); }
   void leave() {
     close();
     state.fetch_sub(1, std::memory_order_release);
   }
-  void close() { state.fetch_and(kSeat - 1, std::memory_order_relaxed); }
 
-  void work() {
-    const int64_t each = count / chunks, extra = count % chunks;
-    for (;;) {
-      const int64_t k = next.fetch_add(1, std::memory_order_relaxed);
-      if (k >= chunks) return;
-      const int64_t begin = k * each + std::min(k, extra);
+  // Takes the chunks of one slice after the other, and begins with its own.
+  void work(int64_t thread) {
+    for (int64_t k = 0; k < slices; ++k) take((thread + k) % slices);
+  }
+  void take(int64_t s) {
+    const int64_t last = share(chunks, slices, s + 1);
+    for (int64_t k; (k = slice[s].next.fetch_add(1, std::memory_order_relaxed)) < last;) {
+      if (failed.load(std::memory_order_relaxed)) return;
       try {
-        body(context, begin, begin + each + (k < extra ? 1 : 0));
+        body(context, share(count, chunks, k), share(count, chunks, k + 1));
       } catch (...) {
         if (!failed.exchange(true, std::memory_order_relaxed)) *failure = std::current_exception();
-        next.store(chunks, std::memory_order_relaxed);
       }
     }
   }
 };
 
-// It has no destructor, because helpers use it until the process ends.
+// Helpers use it until the process ends, so it has no destructor.
 struct Pool {
   Job jobs[kJobs];
-  alignas(64) std::atomic<uint32_t> epoch{0};  // counts published jobs
-  alignas(64) std::atomic<int32_t> asleep{0};
-  std::atomic<int64_t> helpers{0}, seats{0};  // threads that exist, and seats of all jobs
+  alignas(64) std::atomic<uint32_t> epoch{0};             // counts published jobs
+  alignas(64) std::atomic<uint32_t> asleep{0}, woken{0};  // helpers; woken ones sleep a bit longer
+  std::atomic<int64_t> helpers{0}, seats{0};              // threads, and seats of all jobs
   std::atomic<bool> growing{false};
+
+  bool needs_helpers() const { return helpers - asleep < seats; }
 };
 static_assert(std::is_trivially_destructible_v<Pool>);
 constinit Pool pool;
 
+const int64_t cores = std::thread::hardware_concurrency();
+
+// A fork copies no helper, and other threads may have been in the middle of anything.
+[[maybe_unused]] const int at_fork = pthread_atfork(nullptr, nullptr, [] { new (&pool) Pool; });
+
 thread_local int64_t limit = 0;  // 0: none
 
-inline void pause() {
+void pause() {
 #if defined(__x86_64__)
   __builtin_ia32_pause();
 #elif defined(__aarch64__)
@@ -94,48 +117,71 @@ inline void pause() {
 }
 
 #if defined(__linux__)
-void futex(int operation, uint32_t value) {
-  syscall(SYS_futex, reinterpret_cast<uint32_t*>(&pool.epoch), operation, value, nullptr, nullptr,
-          0);
+void futex(std::atomic<uint32_t>& word, int operation, uint32_t value) {
+  static_assert(sizeof(word) == sizeof(uint32_t));
+  syscall(SYS_futex, &word, operation | FUTEX_PRIVATE_FLAG, value, nullptr, nullptr, 0);
 }
-// Sleeps unless or until the epoch is no longer the one seen. It may also return without a reason.
-void sleep(uint32_t seen) { futex(FUTEX_WAIT_PRIVATE, seen); }
-void wake_one() { futex(FUTEX_WAKE_PRIVATE, 1); }
+// May also return without a reason.
+void wait_while(std::atomic<uint32_t>& word, uint32_t value) { futex(word, FUTEX_WAIT, value); }
+void notify_one(std::atomic<uint32_t>& word) { futex(word, FUTEX_WAKE, 1); }
 #else
-void sleep(uint32_t seen) { pool.epoch.wait(seen); }
-void wake_one() { pool.epoch.notify_one(); }
+void wait_while(std::atomic<uint32_t>& word, uint32_t value) { word.wait(value); }
+void notify_one(std::atomic<uint32_t>& word) { word.notify_one(); }
 #endif
 
-// Wakes a helper if fewer are awake than there are seats.
-void wake_if_needed() {
-  const int64_t asleep = pool.asleep;
-  if (asleep > 0 && pool.helpers - asleep < pool.seats) wake_one();
+bool take_one(std::atomic<uint32_t>& number) {
+  uint32_t old = number;
+  while (old > 0) {
+    if (number.compare_exchange_weak(old, old - 1)) return true;
+  }
+  return false;
 }
 
-bool help_any() {
+// Sleeps until somebody wakes this helper, or not at all if the epoch is no longer the one seen.
+void sleep(uint32_t seen) {
+  ++pool.asleep;
+  if (pool.epoch != seen && take_one(pool.asleep)) return;
+  while (!take_one(pool.woken)) wait_while(pool.woken, 0);
+}
+
+void wake_if_needed() {
+  if (!pool.needs_helpers() || !take_one(pool.asleep)) return;
+  ++pool.woken;
+  notify_one(pool.woken);
+}
+
+bool help_any(int64_t helper) {
   for (Job& job : pool.jobs) {
     if (!job.join()) continue;
-    if (job.state.load(std::memory_order_relaxed) >= Job::kSeat) wake_if_needed();
-    job.work();
+    if (job.has_seats()) wake_if_needed();
+    job.work(helper);
     job.leave();
     return true;
   }
   return false;
 }
 
-void help() {
-  using Clock = std::chrono::steady_clock;
-  for (;;) {
-    const uint32_t seen = pool.epoch.load();
-    if (help_any()) continue;
-    const auto end = Clock::now() + kAwake;
-    while (pool.epoch.load(std::memory_order_relaxed) == seen) {
-      for (int k = 0; k < 16; ++k) pause();
-      if (Clock::now() < end) continue;
-      pool.asleep.fetch_add(1);
+// Waits for a new job, and returns whether one came.
+bool stay_awake(uint32_t seen, Microseconds time) {
+  const auto begin = Clock::now();
+  while (pool.epoch.load(std::memory_order_relaxed) == seen) {
+    if (Clock::now() - begin > time) return false;
+    for (int k = 0; k < 16; ++k) pause();
+  }
+  return true;
+}
+
+// What a helper does. Where it waits in vain, such as between the operators of torch, whose own
+// threads need the core, it soon goes to sleep.
+void help(int64_t helper) {
+  for (Microseconds awake = kMostAwake;;) {
+    const uint32_t seen = pool.epoch;
+    if (help_any(helper)) continue;
+    if (stay_awake(seen, awake)) {
+      awake = std::min(2 * awake, kMostAwake);
+    } else {
+      awake = std::max(awake / 2, kLeastAwake);
       sleep(seen);
-      pool.asleep.fetch_sub(1);
-      break;
     }
   }
 }
@@ -144,20 +190,29 @@ void help() {
 // or as cores if several calls run at once.
 void grow(int64_t asked) {
   if (pool.growing.exchange(true, std::memory_order_acquire)) return;
-  // A fork copies no helper, and other threads may have been in the middle of anything.
-  [[maybe_unused]] static const int once =
-      pthread_atfork(nullptr, nullptr, [] { new (&pool) Pool; });
-  static const int64_t cores = std::thread::hardware_concurrency();
   const int64_t most = std::max(asked, cores - 1);
   try {
     while (pool.helpers < std::min<int64_t>(pool.seats, most)) {
-      std::thread(help).detach();
+      std::thread(help, pool.helpers + 1).detach();
       ++pool.helpers;
     }
   } catch (const std::system_error&) {
     // The system allows no more threads, and those that there are do the work.
   }
   pool.growing.store(false, std::memory_order_release);
+}
+
+// To wake a helper takes this thread several microseconds, and the helper comes after tens. So it
+// is only woken if helpers would have had work for half of the recent time.
+bool is_worth_waking(double microseconds) {
+  thread_local double work = 0;
+  thread_local Clock::time_point before{};
+  const auto now = Clock::now();
+  work = std::max(work - Microseconds(now - before).count() / 2, 0.0) + microseconds;
+  before = now;
+  if (work < kWorthWaking) return false;
+  work = 0;
+  return true;
 }
 
 }  // namespace
@@ -169,25 +224,35 @@ int64_t num_threads() { return limit > 0 ? limit : thread_setting(); }
 ThreadLimit::ThreadLimit(int64_t threads) : before(limit) { limit = threads; }
 ThreadLimit::~ThreadLimit() { limit = before; }
 
-void run_ranges(int64_t count, int64_t threads, RangeBody body, void* context) {
+void run_ranges(int64_t count, Threads threads, RangeBody body, void* context) {
   Job* job = pool.jobs;
   while (job->taken.exchange(true, std::memory_order_acquire)) {
     if (++job == pool.jobs + kJobs) return body(context, 0, count);
   }
   std::exception_ptr failure;
-  const int64_t seats = std::min({threads, count, kMostHelpers + 1}) - 1;
-  job->count = count, job->chunks = std::min(count, (seats + 1) * kChunks);
+  const int64_t team = std::min({threads.count, count, kMostHelpers + 1}), seats = team - 1;
+  const double each = std::clamp(threads.microseconds / (team * kChunkTime), 1.0, kChunks);
+  job->count = count, job->chunks = std::min(count, team * static_cast<int64_t>(each));
   job->body = body, job->context = context, job->failure = &failure;
   job->failed.store(false, std::memory_order_relaxed);
-  job->next.store(0, std::memory_order_relaxed);
-  if (pool.seats.fetch_add(seats) + seats > pool.helpers) grow(seats);
+  job->slices = std::min({team, job->chunks, kSlices});
+  for (int64_t s = 0; s < job->slices; ++s) {
+    job->slice[s].next.store(share(job->chunks, job->slices, s), std::memory_order_relaxed);
+  }
+  pool.seats += seats;
   job->state.store(seats * Job::kSeat, std::memory_order_release);
-  pool.epoch.fetch_add(1);
-  wake_if_needed();
-  job->work();
+  ++pool.epoch;
+  if (pool.needs_helpers() && is_worth_waking(threads.microseconds)) {
+    grow(seats);
+    wake_if_needed();
+  }
+  job->work(0);
   job->close();
-  while (job->state.load(std::memory_order_acquire) > 0) pause();
-  pool.seats.fetch_sub(seats);
+  constexpr int kPauses = 1000;
+  for (int k = 0; job->state.load(std::memory_order_acquire) > 0; ++k) {
+    k < kPauses ? pause() : std::this_thread::yield();
+  }
+  pool.seats -= seats;
   job->taken.store(false, std::memory_order_release);
   if (failure != nullptr) std::rethrow_exception(failure);
 }

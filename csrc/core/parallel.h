@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
+#include <limits>
 #include <memory>
 #include <new>
 #include <type_traits>
@@ -93,13 +94,21 @@ class ThreadLimit {
   int64_t before;
 };
 
-// Returns the number of threads that is worth starting for so many microseconds of work. The second
-// thread takes about two microseconds to begin, and more if it has fallen asleep.
-inline int64_t threads_for(double microseconds) {
+// The number of threads of a call, and about how long one thread alone would take.
+struct Threads {
+  int64_t count;
+  double microseconds = std::numeric_limits<double>::max();
+
+  operator int64_t() const { return count; }
+};
+
+// Returns the number of threads that is worth using for so many microseconds of work. A helper that
+// is awake takes about a microsecond to begin. parallel.cpp decides whether to wake one.
+inline Threads threads_for(double microseconds) {
   constexpr double kLeast = 10;  // microseconds for each thread
   const double most = std::max(microseconds / kLeast, 1.0);
   const int64_t threads = num_threads();
-  return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
+  return {most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads, microseconds};
 }
 
 // Returns an estimate of the microseconds that it takes to sample so many points or pixels. On a
@@ -110,30 +119,26 @@ inline double sampling_microseconds(double count, int64_t channels) {
   return count * static_cast<double>(channels + 4) / kPerMicrosecond;
 }
 
-// Calls body(context, begin, end) on contiguous ranges that cover [0, count), in this thread and in
-// helpers (parallel.cpp). Ranges depend on `threads`, and several may be run by one thread.
+// Calls body(context, begin, end) as parallel_ranges does.
 using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
-void run_ranges(int64_t count, int64_t threads, RangeBody body, void* context);
+void run_ranges(int64_t count, Threads threads, RangeBody body, void* context);
 
-// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. The
-// first exception of a range is thrown again, when all ranges that began have ended.
+// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. A
+// thread may take several ranges. The first exception of a range is thrown again when all ranges
+// that began have ended; further ones need not begin.
 template <typename Body>
-void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
+void parallel_ranges(int64_t count, Threads threads, Body&& body) {
   if (count <= 0) return;
-  if (count == 1 || threads <= 1) return body(int64_t{0}, count);
+  if (count == 1 || threads.count <= 1) return body(int64_t{0}, count);
   const auto call = [](void* context, int64_t begin, int64_t end) {
     (*static_cast<std::remove_reference_t<Body>*>(context))(begin, end);
   };
   run_ranges(count, threads, call, const_cast<void*>(static_cast<const void*>(&body)));
 }
-template <typename Body>
-void parallel_ranges(int64_t count, Body&& body) {
-  parallel_ranges(count, num_threads(), std::forward<Body>(body));
-}
 
 // Calls body(begin, end, scratch) in the same way. Each thread gets `bytes` of working memory.
 template <typename Body>
-void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body) {
+void run_with_scratch(int64_t count, Threads threads, int64_t bytes, Body&& body) {
   parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {
     const ThreadMemory scratch(bytes);
     body(begin, end, scratch.get());
