@@ -16,6 +16,7 @@ struct Layer {
   float scale = 1;           // of a step of its tokens
   Quantizer quantizer = {};  // of its tokens
 
+  Layer() = default;
   // The layer whose words are at `packed`.
   Layer(const void* packed, int64_t depth, int64_t columns, bool is_quantized);
 

@@ -1,8 +1,7 @@
-// OpenMP over contiguous ranges, and working memory for each thread. With these, every driver is
+// Threads over contiguous ranges, and working memory for each thread. With these, every driver is
 // fast and still gives the same bits for any number of threads.
 #pragma once
 
-#include <omp.h>
 #if defined(__linux__)
 #  include <sys/mman.h>
 #endif
@@ -10,9 +9,9 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
-#include <exception>
 #include <memory>
 #include <new>
+#include <type_traits>
 #include <utility>
 
 namespace darswin {
@@ -35,10 +34,11 @@ inline void ask_for_large_pages(void* memory, size_t bytes) {
 // Working memory of the calling thread, for the lifetime of this object. It has at least `bytes`
 // bytes, is aligned to cache lines and is not initialized. Up to kKept bytes stay with the thread
 // between uses, because fresh pages cost more than the work of the kernels in them. So a thread can
-// have only one of these objects at a time. Throws std::bad_alloc.
-class ThreadMemory {
+// have only one of these objects of each kind at a time. Throws std::bad_alloc.
+template <int kKind>
+class ThreadMemoryOf {
  public:
-  explicit ThreadMemory(size_t bytes) {
+  explicit ThreadMemoryOf(size_t bytes) {
     if (bytes <= size) return;
     free();
     if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
@@ -47,10 +47,10 @@ class ThreadMemory {
     ask_for_large_pages(memory.get(), bytes);
     size = bytes;
   }
-  ~ThreadMemory() {
+  ~ThreadMemoryOf() {
     if (size > kKept) free();
   }
-  ThreadMemory(const ThreadMemory&) = delete;
+  ThreadMemoryOf(const ThreadMemoryOf&) = delete;
 
   void* get() const { return memory.get(); }
 
@@ -72,6 +72,7 @@ class ThreadMemory {
   static inline thread_local std::unique_ptr<void, Free> memory;
   static inline thread_local size_t size = 0;
 };
+using ThreadMemory = ThreadMemoryOf<0>;
 
 // The number of threads that the caller allows: that of the innermost ThreadLimit of this thread,
 // else that of `thread_setting`.
@@ -109,28 +110,21 @@ inline double sampling_microseconds(double count, int64_t channels) {
   return count * static_cast<double>(channels + 4) / kPerMicrosecond;
 }
 
-// Calls body(begin, end) on contiguous ranges that cover [0, count), each in its own thread. An
-// exception must not leave an OpenMP region. So it is stored, and thrown again when all threads
-// have ended.
+// Calls body(context, begin, end) on contiguous ranges that cover [0, count), in this thread and in
+// helpers (parallel.cpp). Ranges depend on `threads`, and several may be run by one thread.
+using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
+void run_ranges(int64_t count, int64_t threads, RangeBody body, void* context);
+
+// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. The
+// first exception of a range is thrown again, when all ranges that began have ended.
 template <typename Body>
 void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
   if (count <= 0) return;
-  threads = std::min(count, threads);
-  std::exception_ptr failure;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-    const int64_t thread = omp_get_thread_num(), team = omp_get_num_threads();
-    const int64_t each = count / team, extra = count % team;
-    const int64_t begin = thread * each + std::min(thread, extra);
-    const int64_t end = begin + each + (thread < extra ? 1 : 0);
-    try {
-      if (begin < end) body(begin, end);
-    } catch (...) {
-#pragma omp critical(darswin_failure)
-      failure = std::current_exception();
-    }
-  }
-  if (failure != nullptr) std::rethrow_exception(failure);
+  if (count == 1 || threads <= 1) return body(int64_t{0}, count);
+  const auto call = [](void* context, int64_t begin, int64_t end) {
+    (*static_cast<std::remove_reference_t<Body>*>(context))(begin, end);
+  };
+  run_ranges(count, threads, call, const_cast<void*>(static_cast<const void*>(&body)));
 }
 template <typename Body>
 void parallel_ranges(int64_t count, Body&& body) {

@@ -16,7 +16,7 @@
 // exact, so the results are the same.
 #include "../linear.h"
 
-#include "math.h"
+#include "activations.h"
 #include "quantize.h"
 
 namespace darswin {
@@ -88,21 +88,6 @@ struct Pairs : Bytes {
 inline float word(const float* token, int64_t k) { return token[k]; }
 inline uint32_t word(const uint8_t* token, int64_t k) { return load_bits<uint32_t>(token + 4 * k); }
 inline uint32_t word(const uint32_t* token, int64_t k) { return token[k]; }
-
-// Computes x Phi(x), where Phi is the normal distribution. 1 - Phi(|x|) equals e^(-x^2 / 2) times a
-// polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
-inline Floats gelu(Floats x) {
-  const Floats size = x < 0 ? -x : x;
-  const Floats t = 1 / (1 + 0.35f * size);
-  constexpr float terms[] = {-2.91455662e-2f, 1.43970054e-1f,  -2.55711114e-1f,
-                             1.59170855e-1f,  -2.31077446e-2f, 1.05507193e-1f,
-                             1.19833056e-1f,  1.39861846e-1f,  1.39621406e-1f};
-  Floats tail = splat<Floats>(terms[0]);
-#pragma GCC unroll 16
-  for (std::size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
-  tail = tail * t * exponential_of_negative(size * size * -0.5f);
-  return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
-}
 
 // Calls body(i, v) for each register of a tile. The loops are unrolled, because a tile stays in
 // registers only then.

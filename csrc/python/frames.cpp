@@ -1,5 +1,5 @@
 // The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use
-// torch, and OpenMP neither, whose library a system without torch may lack.
+// torch.
 #include "../frames.h"
 
 #include <pybind11/numpy.h>
@@ -10,10 +10,10 @@
 #include <memory>
 #include <optional>
 #include <string>
-#include <thread>
 #include <vector>
 
 #include "../core/dispatch.h"
+#include "../core/parallel.h"
 
 // glibc 2.34 gave the same function a new version (see portable.cpp).
 #if defined(__GLIBC__) && defined(__x86_64__)
@@ -204,16 +204,12 @@ class Sampler {
   }
 
   static void run(const FrameArgs& a, int64_t threads) {
-    // A new thread takes about 20 µs to start, as long as 10,000 points take.
-    constexpr int64_t kLeast = 10'000;
+    constexpr double kPerMicrosecond = 500;  // points
+    const ThreadLimit limit(threads);
     const auto& kernel = kernels<FrameKernels>();
-    threads = std::clamp<int64_t>(a.points / kLeast, 1, threads);
-    const auto end = [&](int64_t t) { return a.points / a.reads * t / threads * a.reads; };
-    std::vector<std::jthread> others;
-    for (int64_t t = 1; t < threads; ++t) {
-      others.emplace_back(kernel.sample, std::cref(a), end(t), end(t + 1));
-    }
-    kernel.sample(a, 0, end(1));
+    parallel_ranges(
+        a.points / a.reads, threads_for(a.points / kPerMicrosecond),
+        [&](int64_t begin, int64_t end) { kernel.sample(a, begin * a.reads, end * a.reads); });
   }
 
   const int64_t reads;

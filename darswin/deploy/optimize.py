@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
+from darswin.deploy.forward import Run, compiled
 from darswin.deploy.packed import fastest_dtype
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
@@ -21,6 +22,7 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
+from darswin.ops import _module
 from darswin.views import Prepared
 from darswin.views.base import Pair
 
@@ -64,8 +66,10 @@ def optimize(
         ValueError: an unsupported dtype or device; a `lens` that is not a single lens; a
             calibration without int8 or for a quantized model; int8 with neither.
         RuntimeError: int8 on a CPU without 8-bit products.
+        ImportError: darswin's compiled module cannot be loaded.
     """
     _check(model, dtype, lens)
+    _module.require("optimize")
     if dtype == "fastest":
         is_whole = calibration is None and not quantized_layers(model)
         lacks_int8 = onednn_lack(torch.int8) is not None
@@ -88,6 +92,8 @@ def optimize(
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
+            if dtype == torch.float32 and part is optimized:
+                vars(part).update(compiled=compiled(part))
     return optimized
 
 
@@ -124,6 +130,12 @@ class Optimized(Model[Any]):
     dtype = torch.float32  # of the original weights
     fixed_lens: Lens | None = None
     known: dict[Pair, Prepared]  # the result of `prepare` for the fixed lens and each size
+    compiled: Run | None = None  # `forward_network` as programs
+
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        if self.compiled is None:
+            return super().forward_network(x, prepared, images)
+        return self.compiled(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         if self.fixed_lens is None:

@@ -99,7 +99,7 @@ def test_without_own_kernels_onednn_computes_the_same(monkeypatch):
     quantized, seen = quantize_model(network(), [batch()]), batch()
     want = optimize(quantized, torch.int8)(*seen)
     monkeypatch.setattr("darswin.deploy.packed.has_own_int8", lambda: False)
-    monkeypatch.setattr("darswin.deploy.packed.packed_blocks", None)
+    monkeypatch.setattr("darswin.deploy.packed.OwnBlocks", None)
     assert relative_error(optimize(quantized, torch.int8)(*seen), want) < 0.005
 
 

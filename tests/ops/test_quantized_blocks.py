@@ -9,7 +9,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from test_blocks import every_stage, stage
 
-from darswin.deploy.packed import OneDNN, Own, norm_parameters, packed_weights
+from darswin.deploy.own import norm_parameters, packed_weights
+from darswin.deploy.packed import OneDNN, Own
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize, with_quantized_layers
 from darswin.ops import _module, cpu_capability
@@ -152,7 +153,7 @@ def test_wrong_arguments():
         (q, weights.view(torch.float32), 4), (q[:, :1], weights, 4), (q, weights.long(), 4),
         (tokens(1, 2**16 + 1), packed_weights(layer(2**16 + 1, 1)), 1),
     ):  # fmt: skip
-        with pytest.raises(RuntimeError, match="_blocks_"):
+        with pytest.raises(RuntimeError, match="_linear"):
             OPS._linear(x, packed, columns, False)
 
 
