@@ -243,6 +243,9 @@ struct Panel {
       Part part{begin, end, count * P::kSplit, weight + begin * width, start};
       if constexpr (P::kSplit > 1) {
         P::template split<int16_t>(part.weight, count * width, split);
+        // The next part, or that of the next panel, follows in memory.
+        const Word* next = part.weight + count * width;
+        for (int64_t k = 0; k < count * width; k += 64 / sizeof(Word)) fetch(next + k);
         part.weight = split;
       }
       if constexpr (is_same_v<P, Fours> && kSignedFours) add_128(part);

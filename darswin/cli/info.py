@@ -5,7 +5,7 @@ import platform
 import torch
 
 from darswin.bench.machine import machine
-from darswin.deploy.packed import fastest_dtype
+from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.layers.linear import onednn_lack
 from darswin.models import list_models, list_pretrained, read_card
 from darswin.ops import _module
@@ -48,14 +48,12 @@ def facts() -> dict[str, str]:
     }
     if lack is not None:
         lines["tier"] = f"the PyTorch reference: {lack}"
-    for dtype in (torch.float32, torch.bfloat16, torch.int8):
+    for dtype in (torch.float32, torch.bfloat16):
         reason = onednn_lack(dtype)
-        other = "none" if dtype == torch.int8 else "torch"
-        lines[_name(dtype)] = "oneDNN" if reason is None else f"{other}: {reason}"
+        lines[_name(dtype)] = "oneDNN" if reason is None else f"torch: {reason}"
     if lack is None:
-        fastest = _name(fastest_dtype())
-        quantized = onednn_lack(torch.int8) is None
-        lines["fastest"] = f"int8 for quantized models, else {fastest}" if quantized else fastest
+        lines["int8"] = "darswin" if has_own_int8() else "oneDNN"
+        lines["fastest"] = f"int8 for quantized models, else {_name(fastest_dtype())}"
     for extra in EXTRAS:
         lines[f"[{extra}]"] = extras.lack(extra) or "installed"
     return lines

@@ -13,7 +13,12 @@ namespace {
 constexpr int kRegister = 16;  // bytes
 constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
 constexpr bool kFused = true;
+#if defined(__clang__) && !defined(__ARM_FEATURE_DOTPROD)
+// Clang assembles no instruction that its target lacks. Apple's targets have this one.
+constexpr bool kHasFours = false, kSignedFours = false;
+#else
 constexpr bool kHasFours = true, kSignedFours = true;
+#endif
 
 using Floats = Vector<float, 4>;
 using Doubles = Vector<double, 2>;
@@ -55,7 +60,7 @@ inline Vector<int32_t, 4> add_pairs(Vector<int32_t, 4> sums, Vector<uint32_t, 4>
 // The instruction is part of the dot products of ARMv8.2. Assembly needs no flag of the compiler.
 inline Vector<int32_t, 4> add_fours(Vector<int32_t, 4> sums, Vector<uint32_t, 4> x,
                                     Vector<uint32_t, 4> weights) {
-  asm(".arch_extension dotprod\n\tsdot %0.4s, %1.16b, %2.16b" : "+w"(sums) : "w"(x), "w"(weights));
+  asm(".arch armv8.2-a+dotprod\n\tsdot %0.4s, %1.16b, %2.16b" : "+w"(sums) : "w"(x), "w"(weights));
   return sums;
 }
 
