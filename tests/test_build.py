@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -57,22 +58,46 @@ def test_environment_chooses_the_tier_at_load(asked, expected):
     assert found.strip() == (expected if expected in _module.tiers() else best)
 
 
+def configured(folder: Path, **settings) -> str:
+    """The compile commands of a build for another system or processor, which is not started."""
+    settings["TORCH_DIR"] = Path(torch.__file__).parent
+    defined = [f"-D{name}={value}" for name, value in settings.items()]
+    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", folder, *defined)
+    return (folder / "compile_commands.json").read_text()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("processor", "tiers"),
     [("x86_64", "generic,avx2,avx512"), ("aarch64", "neon"), ("riscv64", "generic")],
 )
 def test_tiers_of_each_processor(processor, tiers, tmp_path):
-    settings = dict(
-        CMAKE_SYSTEM_NAME="Linux",
-        CMAKE_SYSTEM_PROCESSOR=processor,
-        TORCH_DIR=Path(torch.__file__).parent,
-    )
-    defined = [f"-D{name}={value}" for name, value in settings.items()]
-    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", tmp_path, *defined)
-    commands = (tmp_path / "compile_commands.json").read_text()
+    commands = configured(tmp_path, CMAKE_SYSTEM_NAME="Linux", CMAKE_SYSTEM_PROCESSOR=processor)
     assert f"-DDARSWIN_TIERS={tiers} " in commands
     assert set(re.findall(r"-DTIER=(\w+)", commands)) == set(tiers.split(","))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("processor", "tiers"), [("arm64", "neon"), ("x86_64", "generic,avx2,avx512")]
+)
+def test_the_link_commands_on_macos(processor, tiers, tmp_path):
+    commands = configured(
+        tmp_path,
+        CMAKE_SYSTEM_NAME="Darwin",
+        CMAKE_SYSTEM_PROCESSOR=processor,
+        CMAKE_CXX_COMPILER_WORKS=1,  # no compiler of this machine makes programs for macOS
+        CMAKE_HAVE_LIBC_PTHREAD=1,
+        DARSWIN_PYTHONS=f".cpython-311-darwin.so:{sysconfig.get_path('include')}",
+    )
+    assert f"-DDARSWIN_TIERS={tiers} " in commands
+    links = re.findall(r" LINK_FLAGS = (.*)", (tmp_path / "build.ninja").read_text())
+    library, frames = map(shlex.split, links)
+    assert "-Wl,-exported_symbol,_darswin_*" in library and "-Wl,-dead_strip" in library
+    assert "-Wl,-exported_symbol,_PyInit__frames" in frames
+    assert "-Wl,-undefined,dynamic_lookup" in frames
+    assert not [flag for flag in library + frames if "version-script" in flag or "gc-s" in flag]
+    assert "/lib/libtorch_cpu.dylib" in (tmp_path / "build.ninja").read_text()
 
 
 def test_tiers_can_be_forced_and_agree():
