@@ -175,7 +175,7 @@ pure-wheel: $(STAMP)  ## build the wheel for any system in dist/, which has no c
 	$(BIN)/pip install -q --no-deps --target $(PURE) dist/darswin-*-py3-none-any.whl
 	PYTHONPATH=$(CURDIR)/$(PURE) $(BIN)/python tests/installed.py
 
-published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
+published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel: on Linux in the manylinux_2_28 container, which needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
 
 # The versions of torch to test the wheel of `make wheels` with, each in a fresh environment.

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pybind11
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
@@ -36,8 +37,6 @@ class CMakeBuild(build_ext):
         return super().get_ext_filename(fullname)
 
     def build_extensions(self):
-        import pybind11
-
         torch = importlib.util.find_spec("torch")
         if torch is None:
             raise SystemExit(

@@ -6,7 +6,7 @@ operators and of darswin.frames, or, without the compiled modules, those of mode
 Beside darswin it needs pytest and hypothesis.
 """
 
-import os
+import contextlib
 import sys
 import tempfile
 from pathlib import Path
@@ -32,8 +32,7 @@ def main(options: list[str]) -> int:
         sys.exit(f"darswin must be an installed one, got the checkout's, {darswin.__file__}")
     tests = PURE if darswin.ops.cpu_capability() == "reference" else COMPILED
     settings = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT)]
-    with tempfile.TemporaryDirectory() as elsewhere:
-        os.chdir(elsewhere)
+    with tempfile.TemporaryDirectory() as elsewhere, contextlib.chdir(elsewhere):
         return pytest.main(["-q", *settings, *options, *map(str, tests)])
 
 

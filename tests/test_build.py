@@ -3,12 +3,14 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
 import zipfile
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -57,22 +59,48 @@ def test_environment_chooses_the_tier_at_load(asked, expected):
     assert found.strip() == (expected if expected in _module.tiers() else best)
 
 
+def configured(folder: Path, **settings) -> str:
+    """The compile commands of a build for another system or processor, which is not started."""
+    settings["TORCH_DIR"] = Path(torch.__file__).parent
+    defined = [f"-D{name}={value}" for name, value in settings.items()]
+    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", folder, *defined)
+    return (folder / "compile_commands.json").read_text()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("processor", "tiers"),
     [("x86_64", "generic,avx2,avx512"), ("aarch64", "neon"), ("riscv64", "generic")],
 )
 def test_tiers_of_each_processor(processor, tiers, tmp_path):
-    settings = dict(
-        CMAKE_SYSTEM_NAME="Linux",
-        CMAKE_SYSTEM_PROCESSOR=processor,
-        TORCH_DIR=Path(torch.__file__).parent,
-    )
-    defined = [f"-D{name}={value}" for name, value in settings.items()]
-    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", tmp_path, *defined)
-    commands = (tmp_path / "compile_commands.json").read_text()
+    commands = configured(tmp_path, CMAKE_SYSTEM_NAME="Linux", CMAKE_SYSTEM_PROCESSOR=processor)
     assert f"-DDARSWIN_TIERS={tiers} " in commands
     assert set(re.findall(r"-DTIER=(\w+)", commands)) == set(tiers.split(","))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("processor", "tiers"), [("arm64", "neon"), ("x86_64", "generic,avx2,avx512")]
+)
+def test_the_link_commands_on_macos(processor, tiers, tmp_path):
+    commands = configured(
+        tmp_path,
+        CMAKE_SYSTEM_NAME="Darwin",
+        CMAKE_SYSTEM_PROCESSOR=processor,
+        CMAKE_CXX_COMPILER_WORKS=1,  # no compiler of this machine makes programs for macOS
+        CMAKE_HAVE_LIBC_PTHREAD=1,
+        DARSWIN_PYTHONS=f".cpython-311-darwin.so:{sysconfig.get_path('include')}",
+    )
+    assert f"-DDARSWIN_TIERS={tiers} " in commands
+    links = re.findall(r" LINK_FLAGS = (.*)", (tmp_path / "build.ninja").read_text())
+    library, c_library, python = map(shlex.split, links)
+    for flags, exported in ((library, "darswin_*"), (c_library, "darswin_*"), (python, "PyInit_*")):
+        names = [flag for flag in flags if flag.startswith("-Wl,-exported_symbol,_")]
+        assert len(names) == 1 and fnmatch(names[0].rpartition(",_")[2], exported)
+        assert "-Wl,-dead_strip" in flags
+        assert not [flag for flag in flags if "version-script" in flag or "gc-sections" in flag]
+    assert "-Wl,-undefined,dynamic_lookup" in python
+    assert "/lib/libtorch_cpu.dylib" in (tmp_path / "build.ninja").read_text()
 
 
 def test_tiers_can_be_forced_and_agree():

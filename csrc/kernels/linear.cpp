@@ -86,7 +86,9 @@ struct Pairs : Bytes {
 };
 
 inline float word(const float* token, int64_t k) { return token[k]; }
-inline uint32_t word(const uint8_t* token, int64_t k) { return load_bits<uint32_t>(token + 4 * k); }
+[[maybe_unused]] inline uint32_t word(const uint8_t* token, int64_t k) {
+  return load_bits<uint32_t>(token + 4 * k);
+}
 inline uint32_t word(const uint32_t* token, int64_t k) { return token[k]; }
 
 // Calls body(i, v) for each register of a tile. The loops are unrolled, because a tile stays in
