@@ -52,7 +52,7 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_pictures.py \
+	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_*.py \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 

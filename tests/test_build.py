@@ -189,10 +189,12 @@ def test_the_module_keeps_to_the_stable_abi_of_torch_2_10():
 
 
 FRAMES = Path(_frames.__file__)
-BOTH = pytest.mark.parametrize("path", [_module.FILE, FRAMES], ids=["libdarswin", "frames"])
+LIBRARY = FRAMES.parent / "libdarswin_frames.so"
+HEADER = FRAMES.parent / "include" / "darswin_frames.h"
+ALL = pytest.mark.parametrize("path", [_module.FILE, FRAMES, LIBRARY], ids=lambda path: path.name)
 
 
-@BOTH
+@ALL
 def test_the_modules_hold_no_path_of_the_build_machine(path):
     module = path.read_bytes()
     sources = re.findall(rb"[\w./+-]+\.(?:h|hpp|cpp)\b", module)
@@ -202,7 +204,7 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
     dynamic = output("readelf", "-d", path)
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
-    assert any("libtorch_cpu.so" in line for line in needed) == (path != FRAMES)
+    assert any("libtorch_cpu.so" in line for line in needed) == (path == _module.FILE)
     assert not any("omp" in line for line in needed)
     assert not any("/" in line.split("[")[1] for line in needed)
 
@@ -212,12 +214,13 @@ def test_the_modules_export_no_more_than_needed():
     for path, names in [
         (_module.FILE, {f"darswin_{fact}" for fact in facts}),
         (FRAMES, {"PyInit__frames"}),
+        (LIBRARY, set(re.findall(r"\b(darswin_\w+)\(", HEADER.read_text()))),
     ]:
         shown = output("nm", "-D", "--defined-only", path)
         assert {line.split()[-1] for line in shown.splitlines()} == names
 
 
-@BOTH
+@ALL
 def test_the_modules_ask_for_nothing_newer_than_manylinux_2_28(path):
     compiler, version = _module.build_info()["compiler"].split()[:2]
     if compiler == "clang++":  # it uses the headers of g++
@@ -307,7 +310,8 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_pa
         for name in names
         if name.endswith(".so")
     }
-    assert modules == {"libdarswin.so", FRAMES.name, "_frames.another-python.so"}
+    assert modules == {"libdarswin.so", FRAMES.name, "_frames.another-python.so", LIBRARY.name}
+    assert "darswin/frames/include/darswin_frames.h" in names
     assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"
     output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)

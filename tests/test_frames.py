@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
+from frame_samples import LAYOUTS, MEAN, ROUND, STD, bilinear, in_layout, random_frame
 from helpers import CAMERAS
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,24 +29,6 @@ from darswin.views import PolarView, make_view
 
 def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
     return PolarView(rings, sectors, samples, layout=layout, mean=mean, std=std, **options).eval()
-
-
-def in_layout(frame, kind):
-    """The same frame in another memory layout."""
-    if kind == "flipped":
-        return np.ascontiguousarray(frame[::-1, ::-1])[::-1, ::-1]
-    if kind == "gaps":
-        room = np.zeros((frame.shape[0] * 2, frame.shape[1] + 5, *frame.shape[2:]), np.uint8)
-        room[1::2, 3:-2] = frame
-        return room[1::2, 3:-2]
-    if kind == "bgr" and frame.ndim == 3:
-        return np.ascontiguousarray(frame[..., ::-1])[..., ::-1]
-    if kind == "planes" and frame.ndim == 3:
-        return np.ascontiguousarray(frame.transpose(2, 0, 1)).transpose(1, 2, 0)
-    return np.asfortranarray(frame) if kind == "turned" else frame
-
-
-LAYOUTS = ("plain", "flipped", "gaps", "bgr", "planes", "turned")
 
 
 @st.composite

@@ -79,6 +79,9 @@ FrameNetwork::FrameNetwork(const std::string& path) try : file(path) {
   const bool classifies = how == Finish::probabilities;
   require(!classifies || (output_shape(0).size() == 1 && output_shape(0)[0] > 0),
           "its probabilities have a wrong shape");
+  require(names.empty() || (!output_shape(0).empty() &&
+                            static_cast<int64_t>(names.size()) == output_shape(0)[0]),
+          "it has not a label for each class");
 
   const int64_t points = product(sampler->output_shape(1));
   colors = network->input_numbers(0) / points;
