@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -166,6 +166,14 @@ DEST := dist
 repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
 	  --exclude 'libtorch*' --exclude 'libc10*' "$(WHEEL)"
+
+# For systems without a wheel of their own: the operators run their PyTorch reference.
+PURE := build/pure
+pure-wheel: $(STAMP)  ## build the wheel for any system in dist/, which has no compiled modules, and test it
+	rm -rf build/lib $(PURE)
+	DARSWIN_PURE=1 $(BIN)/python -m build --no-isolation --wheel --outdir dist
+	$(BIN)/pip install -q --no-deps --target $(PURE) dist/darswin-*-py3-none-any.whl
+	PYTHONPATH=$(CURDIR)/$(PURE) $(BIN)/python tests/installed.py
 
 published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
 	$(BIN)/cibuildwheel --output-dir dist

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pybind11
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
@@ -37,6 +36,8 @@ class CMakeBuild(build_ext):
         return super().get_ext_filename(fullname)
 
     def build_extensions(self):
+        import pybind11
+
         torch = importlib.util.find_spec("torch")
         if torch is None:
             raise SystemExit(
@@ -64,10 +65,12 @@ class PlatformWheel(bdist_wheel):
     wheel has a module darswin.frames._frames for each Python it was built for."""
 
     def get_tag(self):
-        return "py3", "none", super().get_tag()[2]
+        return "py3", "none", super().get_tag()[2]  # "any" if there are no modules
 
 
+pure = os.environ.get("DARSWIN_PURE") == "1"  # a wheel without compiled modules, for any system
+modules = () if pure else ("darswin.libdarswin", "darswin.frames._frames")
 setup(
-    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin.frames._frames", [])],
+    ext_modules=[Extension(name, []) for name in modules],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -97,25 +98,32 @@ def test_build_info():
     assert info["cxx_standard"] >= 202002 and "stable" in info["torch_abi"]
 
 
+BUILD = [sys.executable, "-m", "build", "--no-isolation"]
+
+
 @pytest.fixture(scope="module")
-def unpacked(tmp_path_factory) -> Path:
-    """The sdist, unpacked, and the wheel made there, in its `dist`: without optimization, in a
-    fraction of the time."""
+def sources(tmp_path_factory) -> Path:
+    """The sdist, unpacked."""
     folder = tmp_path_factory.mktemp("sdist")
-    build = [sys.executable, "-m", "build", "--no-isolation"]
-    output(*build, "--sdist", "--outdir", folder, ROOT)
+    output(*BUILD, "--sdist", "--outdir", folder, ROOT)
     (sdist,) = folder.glob("darswin-*.tar.gz")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
-    root = folder / sdist.name.removesuffix(".tar.gz")
+    return folder / sdist.name.removesuffix(".tar.gz")
+
+
+@pytest.fixture(scope="module")
+def unpacked(sources) -> Path:
+    """The folder of the sdist with the wheel made there, in its `dist`: without optimization, in a
+    fraction of the time."""
     # Stands for a Python beside this one: the same headers, and another name of the module.
     include = sysconfig.get_path("include")
-    another = folder / "another-python"
+    another = sources / "another-python"
     another.write_text(f"#!/bin/sh\necho .another-python.so:{include}\n")
     another.chmod(0o755)
     environment = {"CMAKE_BUILD_TYPE": "None", "DARSWIN_PYTHONS": str(another)}
-    output(*build, "--wheel", root, env=environment)
-    return root
+    output(*BUILD, "--wheel", sources, env=environment)
+    return sources
 
 
 @pytest.mark.parametrize("optimized", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -172,7 +180,7 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
 
 
 def test_the_modules_export_no_more_than_needed():
-    facts = {"tier", "tiers", "set_tier", "build_info"}
+    facts = {"tier", "tiers", "set_tier", "build_info", "allow_fours"}
     for path, names in [
         (_module.FILE, {f"darswin_{fact}" for fact in facts}),
         (FRAMES, {"PyInit__frames"}),
@@ -196,12 +204,15 @@ def test_the_modules_ask_for_nothing_newer_than_manylinux_2_28(path):
         assert tuple(map(int, version.split("."))) <= newest[library], f"{library}_{version}"
 
 
-def test_a_missing_module_is_explained(monkeypatch, tmp_path):
+def test_a_module_that_cannot_be_loaded_is_explained(monkeypatch, tmp_path):
     monkeypatch.setattr(_module, "FILE", tmp_path / "libdarswin.so")
+    with pytest.raises(ImportError, match=f"no compiled module, {_module.FILE}: its wheel is"):
+        _module.load()
+    _module.FILE.write_bytes(b"not a library")
     with pytest.raises(ImportError) as caught:
         _module.load()
     message = str(caught.value)
-    assert f"{_module.FILE}: cannot open" in message
+    assert f"{_module.FILE}: file too short" in message
     assert torch.__version__ in message and "torch>=2.10" in message
     assert "make build" in message and "pip install" in message
     assert isinstance(caught.value.__cause__, OSError)
@@ -214,17 +225,48 @@ def test_python_in_a_checkout_that_is_not_built_is_explained(monkeypatch, tmp_pa
         _module.load()
 
 
+@pytest.fixture
+def without(tmp_path) -> Path:
+    """A folder with the package, but without its compiled modules."""
+    shutil.copytree(ROOT / "darswin", tmp_path / "darswin", ignore=shutil.ignore_patterns("*.so"))
+    return tmp_path
+
+
+def without_module(folder: Path) -> str:
+    """What a Python prints that imports darswin from this folder, and checks the reference."""
+    program = ROOT / "tests" / "without_module.py"
+    return output(sys.executable, program, cwd=folder, env={"PYTHONPATH": str(folder)})
+
+
 @pytest.mark.slow
-def test_a_broken_module_names_its_file(tmp_path):
-    package = tmp_path / "darswin"
-    package.mkdir()
-    for name in ("__init__.py", "ops"):
-        (package / name).symlink_to(ROOT / "darswin" / name)
-    (package / "libdarswin.so").write_bytes(b"not a library")
-    command = [sys.executable, "-c", "import darswin.ops"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode != 0
-    assert "libdarswin.so: file too short" in done.stderr and "make build" in done.stderr
+def test_without_its_modules_darswin_runs_the_reference(without):
+    said = without_module(without)
+    assert f"no compiled module, {without / 'darswin' / 'libdarswin.so'}: its wheel is" in said
+    assert "darswin.frames: cannot load" in said and "No module named 'darswin.frames._fr" in said
+
+
+@pytest.mark.slow
+def test_with_a_broken_module_darswin_runs_the_reference_and_names_the_file(without):
+    (without / "darswin" / "libdarswin.so").write_bytes(b"not a library")
+    said = without_module(without)
+    assert f"{without / 'darswin' / 'libdarswin.so'}: file too short" in said
+    assert "make build" in said and f"torch {torch.__version__} is running" in said
+
+
+@pytest.mark.slow
+def test_a_wheel_for_any_system_passes_the_tests_of_models(sources, tmp_path):
+    output(*BUILD, "--wheel", sources, "--outdir", tmp_path, env={"DARSWIN_PURE": "1"})
+    (wheel,) = tmp_path.glob("*.whl")
+    assert re.fullmatch(r"darswin-[\d.]+-py3-none-any.whl", wheel.name)
+    assert not [name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".so")]
+    site = tmp_path / "site"
+    output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", site, wheel)
+    assert str(site) in without_module(site)
+    # Of each kind of model one, and the layers and the lenses.
+    names = "darswin_ra_nano or swin_undis_nano or dat_nano or layers or lens"
+    tests = [ROOT / "tests" / "installed.py", "-x", "-k", names]
+    done = output(sys.executable, *tests, env={"PYTHONPATH": str(site)})
+    assert re.search(r"\d\d\d passed", done) and "failed" not in done
 
 
 @pytest.mark.slow

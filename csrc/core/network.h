@@ -34,6 +34,8 @@ enum class Opcode : int64_t {
   distance,  // x, in place, typical distance as the bits of a float
 };
 
+constexpr int64_t kCopyAxes = 5;
+
 // The numbers of an input: (rows, numbers of one image) with a row for each image or one for all.
 struct Input {
   const float* data;

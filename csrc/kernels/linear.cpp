@@ -80,6 +80,7 @@ struct Pairs : Bytes {
     };
     int64_t k = 0;
     for (; k + kL <= words; k += kL) some.template operator()<kL>(k);
+    for (; k + 4 <= words; k += 4) some.template operator()<4>(k);
     for (; k < words; ++k) some.template operator()<1>(k);
   }
 };
@@ -185,21 +186,28 @@ struct Panel {
   [[gnu::noinline]] void finish(const Floats (&tile)[kRows][kWide], int64_t place,
                                 int64_t left) const {
     const Quantize quantize(a.quantizer);
+    const After after = a.after;
+    const int64_t columns = a.columns;
+    float* const out = a.out;
+    uint8_t* const quantized = a.quantized;
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
-        const int64_t to = place + i * a.columns + v * kL, count = smaller(kL, left - v * kL);
-        const Floats result = a.after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
-        float lanes[kL];
-        store(lanes, result);
-        if (a.quantized != nullptr) {
-          quantize(a.quantized + to, lanes, count);
-        } else if (a.after != After::add && count == kL) {
-          store(a.out + to, result);
-        } else {
+        const int64_t to = place + i * columns + v * kL, count = smaller(kL, left - v * kL);
+        const Floats result = after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
+        if (count < kL || after == After::add) {
+          float lanes[kL];
+          store(lanes, result);
           for (int64_t lane = 0; lane < count; ++lane) {
-            float& number = a.out[to + lane];
-            number = a.after == After::add ? number + lanes[lane] : lanes[lane];
+            if (quantized != nullptr) {
+              quantize(quantized + to + lane, lanes[lane]);
+            } else {
+              out[to + lane] = after == After::add ? out[to + lane] + lanes[lane] : lanes[lane];
+            }
           }
+        } else if (quantized != nullptr) {
+          quantize(quantized + to, result);
+        } else {
+          store(out + to, result);
         }
       }
     }

@@ -10,17 +10,6 @@
 namespace darswin {
 namespace {
 
-inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, kLanes<float>> v) {
-  if constexpr (kRegister == 64) {
-    store_bits(to, __builtin_convertvector(v, Vector<uint8_t, kLanes<float>>));
-  } else {  // the compiler's own conversion takes one number at a time
-    auto bytes = (Vector<uint8_t, kRegister>)v;
-    bytes = evens(bytes, bytes);
-    bytes = evens(bytes, bytes);
-    __builtin_memcpy(to, &bytes, kLanes<float>);
-  }
-}
-
 // Works on one float or on a register, Floats.
 class Quantize {
  public:
@@ -34,8 +23,8 @@ class Quantize {
   void operator()(uint8_t* to, V x) const {
     constexpr float kShift = 12582912.0f;  // its own lowest 22 bits are 0
     V value = x == x ? x * steps : V{};
-    value = value > lowest ? value : V{} + lowest;
-    value = value < highest ? value : V{} + highest;
+    value = value > lowest ? value : splat<V>(lowest);
+    value = value < highest ? value : splat<V>(highest);
     const auto bits = __builtin_bit_cast(BitsOf<V>, value + kShift) + zero_point;
     if constexpr (is_same_v<V, float>) {
       *to = static_cast<uint8_t>(bits);

@@ -21,6 +21,7 @@ from darswin.train.data import RunData
 from darswin.train.tasks import TASKS
 from darswin.utils.parameters import check
 from darswin.utils.progress import Progress
+from darswin.utils.text import read_text
 
 BATCH = 16
 
@@ -73,7 +74,7 @@ def quantize(
 
 def _data_of(run: Path) -> RunData:
     """The data of a run, from its configuration."""
-    config = yaml.safe_load((run / "config.yaml").read_text())
+    config = yaml.safe_load(read_text(run / "config.yaml"))
     options = config["data"] | dict(batch_size=BATCH, workers=0)
     return TASKS[config.get("task", FIRST_TASK)].data(**options)
 

@@ -22,6 +22,7 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
+from darswin.ops import _module
 from darswin.views import Prepared
 from darswin.views.base import Pair
 
@@ -65,8 +66,10 @@ def optimize(
         ValueError: an unsupported dtype or device; a `lens` that is not a single lens; a
             calibration without int8 or for a quantized model; int8 with neither.
         RuntimeError: int8 on a CPU without 8-bit products.
+        ImportError: darswin's compiled module cannot be loaded.
     """
     _check(model, dtype, lens)
+    _module.require("optimize")
     if dtype == "fastest":
         is_whole = calibration is None and not quantized_layers(model)
         lacks_int8 = onednn_lack(torch.int8) is not None

@@ -1,20 +1,24 @@
 """Layers by our own operators. They are plain callables: a module would take a microsecond more for
 each call."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+import darswin.ops  # noqa: F401  (it registers our operators)
 from darswin.layers.quantized import Quantization, quantized_layers
+from darswin.ops import _module
 
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
 def own_operator(name: str) -> Callable[..., Any]:
-    """One of our operators for the CPU."""
+    """One of our operators for the CPU. Without the compiled module, it refuses calls."""
+    if _module.LACK is not None:
+        return partial(_module.require, name)
     # Not by way of autograd, which would look for gradients and count versions: there are none.
     return partial(getattr(torch.ops.darswin, name).default.redispatch, _CPU)
 
@@ -75,3 +79,33 @@ class OwnNorm:
 
     def __call__(self, x: Tensor) -> Tensor:
         return _NORM(x, self.parameters, self.eps)
+
+
+class PackedBlocks:
+    """The blocks of a stage, packed. All of them have window attention."""
+
+    def __init__(self, blocks: Sequence[Any]):
+        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
+        self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
+            (
+                OwnNorm(block.norm1),
+                packed_weights(block.attn.qkv),
+                packed_weights(block.attn.proj),
+                OwnNorm(block.norm2),
+                packed_weights(block.mlp.fc1),
+                packed_weights(block.mlp.fc2),
+            )
+            for block in blocks
+        ]
+        # Of each block: the window, the shift, and whether an axis is periodic.
+        self.windows: list[list[int]] = [
+            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
+        ]
+        attn = blocks[0].attn
+        self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
+        self.map_shape = (*attn.map_size, attn.dim)
+
+    @property
+    def table_shapes(self) -> list[tuple[int, int, int]]:
+        """The shape of the position bias of each block."""
+        return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from darswin.deploy.own import (
     OwnLinear,
     OwnNorm,
+    PackedBlocks,
     norm_parameters,
     own_operator,
     packed_weights,
@@ -44,29 +45,11 @@ def has_own_int8() -> bool:
     return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
-class OwnBlocks:
-    """The blocks of a stage by one operator. All of them have window attention."""
+class OwnBlocks(PackedBlocks):
+    """The blocks of a stage by one operator."""
 
     def __init__(self, blocks: Sequence[Any]):
-        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
-        self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
-            (
-                OwnNorm(block.norm1),
-                packed_weights(block.attn.qkv),
-                packed_weights(block.attn.proj),
-                OwnNorm(block.norm2),
-                packed_weights(block.mlp.fc1),
-                packed_weights(block.mlp.fc2),
-            )
-            for block in blocks
-        ]
-        # Of each block: the window, the shift, and whether an axis is periodic.
-        self.windows: list[list[int]] = [
-            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
-        ]
-        attn = blocks[0].attn
-        self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
-        self.map_shape = (*attn.map_size, attn.dim)
+        super().__init__(blocks)
         self.weights = Weights()  # or those of a whole model
 
     @cached_property
@@ -79,11 +62,6 @@ class OwnBlocks:
         program.blocks(out, self, tables)
         program.output(out)
         return program.words()
-
-    @property
-    def table_shapes(self) -> list[tuple[int, int, int]]:
-        """The shape of the position bias of each block."""
-        return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]
 
     def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
         words = self.words

@@ -4,15 +4,12 @@ import struct
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from darswin.deploy.own import OwnLinear, OwnNorm, own_operator, pack
-
-if TYPE_CHECKING:
-    from darswin.deploy.packed import OwnBlocks
+from darswin.deploy.own import OwnLinear, OwnNorm, PackedBlocks, own_operator, pack
 
 RUN = own_operator("_run")
 
@@ -139,7 +136,7 @@ class Program:
     def _norm_offset(self, norm: OwnNorm) -> int:
         return self.weights.offset(norm.words)
 
-    def blocks(self, x: Slot, blocks: "OwnBlocks", tables: Sequence[Slot]) -> None:
+    def blocks(self, x: Slot, blocks: PackedBlocks, tables: Sequence[Slot]) -> None:
         """The blocks of a stage, in place."""
         rings, sectors, dim = x.shape
         steps = zip(blocks.layers, blocks.windows, tables, strict=True)

@@ -27,7 +27,7 @@ from darswin.utils.files import replace_file
 from darswin.utils.tables import read_table
 
 try:
-    from darswin.frames import _frames
+    import darswin.frames._frames as _frames
 except ImportError as error:
     raise ImportError(
         f"cannot load darswin's compiled module for frames: {error}. The package has one for each "

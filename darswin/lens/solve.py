@@ -6,11 +6,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from darswin.ops._library import transformed
 from darswin.ops.checks import readable
 
 Function = Callable[[Tensor], Tensor]
 
 _STEPS = 40  # Newton steps or bisections
+_TABLE = 1024  # entries of a table of the function
 
 
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
@@ -22,21 +24,43 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     order of the error, so derivatives up to the third are exact.
     """
     with torch.no_grad():
-        last = function(end)
-        high = torch.broadcast_tensors(end, value)[0]
-        low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
-        moved = high
-        halvings = 1 - round(math.log2(torch.finfo(x.dtype).eps))  # more change nothing
-        for _ in range(min(_STEPS, halvings)):
+        eager = readable(value) and not transformed()
+        low, high, x = _brackets(function, value, end, eager)
+        eps = torch.finfo(x.dtype).eps
+        # After a Newton step of this length, x is exact to rounding.
+        moved, near = high - low, math.sqrt(eps) * end
+        for _ in range(min(_STEPS, 1 - round(math.log2(eps)))):  # more halvings change nothing
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
-            newton = x - error / slope(x)
-            fine = (newton >= low) & (newton <= high) & (2 * (newton - x).abs() <= moved)
+            step = error / slope(x)
+            newton, length = x - step, step.abs()
+            fine = (newton >= low) & (newton <= high) & (2 * length <= moved)
+            fine = fine | (length <= near)  # rounding may take it across an end of the bracket
             before, x = x, torch.where(fine, newton, (low + high) / 2)
             moved = (x - before).abs()
+            if eager and not (moved > near).any():
+                break
     for _ in range(2):
         x = x - (function(x) - value) / slope(x)
     return x
+
+
+def _brackets(
+    function: Function, value: Tensor, end: Tensor, eager: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Below and above the x of `inverse`, and a first guess of it."""
+    high = torch.broadcast_tensors(end, value)[0]
+    few = high.numel() < 4 * _TABLE * end.numel()
+    if few or not eager or end.dim() == 0:
+        return torch.zeros_like(high), high, high * (value / function(end)).clamp(0, 1)
+    # With one end for many values, as for the pixels of an image: from a table.
+    steps = torch.linspace(0, 1, _TABLE, dtype=end.dtype, device=end.device)
+    points = end.reshape(-1, 1) * steps
+    table, rows = function(points), value.expand_as(high).reshape(len(points), -1)
+    after = torch.searchsorted(table, rows).clamp(1, _TABLE - 1)
+    (x0, y0), (x1, y1) = ((points.gather(1, k), table.gather(1, k)) for k in (after - 1, after))
+    guess = x0 + (x1 - x0) * ((rows - y0) / (y1 - y0)).clamp(0, 1)
+    return x0.view_as(high), x1.view_as(high), guess.view_as(high)
 
 
 @torch.no_grad()

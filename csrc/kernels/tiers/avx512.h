@@ -41,6 +41,10 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);
 }
 
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 16> v) {
+  store_bits(to, __builtin_convertvector(v, Vector<uint8_t, 16>));
+}
+
 inline Words lower_product(Words a, uint32_t b) {
   const Words factor = splat<Words>(static_cast<uint64_t>(b));
   return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);

@@ -47,6 +47,14 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)(bits << 16);
 }
 
+// Stores the lowest byte of each lane.
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 4> v) {
+  auto bytes = (Vector<uint8_t, 16>)v;
+  bytes = evens(bytes, bytes);
+  bytes = evens(bytes, bytes);
+  __builtin_memcpy(to, &bytes, 4);
+}
+
 // Returns the products of the lower halves of the lanes.
 inline Words lower_product(Words a, uint32_t b) {
   const Words factor = splat<Words>(static_cast<uint64_t>(b));

@@ -35,6 +35,11 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)vshll_n_u16(load_bits<uint16x4_t>(from), 16);
 }
 
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 4> v) {
+  const auto halves = vcombine_u16(vmovn_u32((uint32x4_t)v), vdup_n_u16(0));
+  vst1_lane_u32(reinterpret_cast<uint32_t*>(to), vreinterpret_u32_u8(vmovn_u16(halves)), 0);
+}
+
 inline Words lower_product(Words a, uint32_t b) {
   return (Words)vmull_n_u32(vmovn_u64((uint64x2_t)a), b);
 }
