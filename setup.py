@@ -31,7 +31,7 @@ def pythons() -> str:
 
 class CMakeBuild(build_ext):
     def get_ext_filename(self, fullname):
-        if fullname.endswith("libdarswin"):
+        if fullname.rpartition(".")[2].startswith("libdarswin"):
             return fullname.replace(".", "/") + ".so"
         return super().get_ext_filename(fullname)
 
@@ -69,8 +69,8 @@ class PlatformWheel(bdist_wheel):
 
 
 pure = os.environ.get("DARSWIN_PURE") == "1"  # a wheel without compiled modules, for any system
-modules = () if pure else ("darswin.libdarswin", "darswin.frames._frames")
+MODULES = ("libdarswin", "frames._frames", "frames.libdarswin_frames")
 setup(
-    ext_modules=[Extension(name, []) for name in modules],
+    ext_modules=[] if pure else [Extension(f"darswin.{name}", []) for name in MODULES],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

@@ -19,7 +19,7 @@ from lens_examples import RANDOM, random_lens
 
 from darswin import create_model, frames, list_models
 from darswin.compat import OfficialDarSwin
-from darswin.frames import _frames
+from darswin.frames import _frames, plans
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
 from darswin.models.encoder import Encoder
@@ -420,11 +420,11 @@ def test_values_that_were_not_written_are_refused(name, tmp_path):
 def test_a_file_of_version_1_is_read(normalize_first, tmp_path):
     path, frame = tmp_path / "camera.npz", random_frame(50, 60, 3)
     content = dict(vars(PLAN), darswin_plan=1, normalize_first=normalize_first)
-    np.savez(path, **content, digest=frames._digest(content))
+    np.savez(path, **content, digest=plans._digest(content))
     assert frames.Plan.load(path) == PLAN
     np.testing.assert_array_equal(frames.Sampler(path)(frame), frames.Sampler(PLAN)(frame))
     damaged = dict(content, normalize_first=not normalize_first)
-    np.savez(path, **damaged, digest=frames._digest(content))
+    np.savez(path, **damaged, digest=plans._digest(content))
     with pytest.raises(ValueError, match="is a damaged plan"):
         frames.Plan.load(path)
 

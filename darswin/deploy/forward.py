@@ -152,7 +152,7 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
             x = program.resized(x, seen.shape[1:])
             pixels = program.channels_last(seen, *rays) if model.head.skip_width else None
             x = refined(program, model.head, x, pixels)
-        x = _back(program, x, prepared, constants)
+        x = _back(program, model.view, x, prepared, constants)
         if reads_frame:
             maps = [frame] + [
                 program.permuted(r, r.shape, (1, 2, 0), *r.shape[1:], RAYS) for r in rays
@@ -168,7 +168,9 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
     return FrameProgram(program.words(), program.weights.words, constants, reads_frame, classifier)
 
 
-def _back(program: Program, x: Slot, prepared: Prepared, constants: list[Tensor]) -> Slot:
+def _back(
+    program: Program, view: Any, x: Slot, prepared: Prepared, constants: list[Tensor]
+) -> Slot:
     """A map of the network → the pixels of the images."""
     back = prepared.back
     if isinstance(back, PixelGrid):
@@ -177,8 +179,9 @@ def _back(program: Program, x: Slot, prepared: Prepared, constants: list[Tensor]
         return program.to_image(x, program.input(*back.plan.shape[1:]))
     if back is None:
         return program.resized(x, prepared.size)
-    constants.append(back)
-    return program.sampled(x, program.input(*back.shape[1:]))
+    points = view.back_points(prepared, x.shape[:2])
+    constants.append(points)
+    return program.sampled(x, program.input(*points.shape[1:]))
 
 
 def _results(
