@@ -93,9 +93,8 @@ def export(
     """
     import torch
 
-    from darswin.deploy.forward import frame_program
+    from darswin.deploy.forward import NoProgramError, frame_program
     from darswin.deploy.optimize import optimize
-    from darswin.deploy.program import NoProgramError
     from darswin.frames.reading import every_pixel, reading
     from darswin.layers.quantized import quantized_layers
     from darswin.models.encoder import FeatureMaps
