@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+import darswin.ops  # noqa: F401  (it registers our operators)
 from darswin.layers.quantized import Quantization, quantized_layers
 from darswin.ops import _module
 
