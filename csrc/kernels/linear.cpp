@@ -46,8 +46,8 @@ struct Bytes {
 
 // Four bytes in a word. If the CPU's bytes are signed, the copy of a token is 128 less.
 struct Fours : Bytes {
-  static constexpr int64_t kSplit = 1;
-  static constexpr bool kCopies = kSignedFours;
+  [[maybe_unused]] static constexpr int64_t kSplit = 1;
+  [[maybe_unused]] static constexpr bool kCopies = kSignedFours;
   template <typename S, typename W>
   static S add(S sums, W x, W weights) {
     return add_fours(sums, x, weights);
