@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -52,7 +52,7 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_pictures.py \
+	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_*.py \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
@@ -63,7 +63,7 @@ PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=
 
 test-asan: build  ## test the operators on every tier with AddressSanitizer and UBSan
 	@rm -rf $(SANITIZED)/darswin
-	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined \
+	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined DARSWIN_BUILD=cmake-sanitized \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
 	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
 	cd $(SANITIZED); for tier in $$tiers; do \
@@ -73,6 +73,17 @@ test-asan: build  ## test the operators on every tier with AddressSanitizer and 
 	    $(PYTEST) -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
 	      -m "not unsanitized" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py; \
 	done
+
+# The modules of another compiler, in the same way. Needs `apt-get install clang-16`.
+CLANG := build/clang
+CLANG_CXX ?= clang++-16
+
+test-clang: build  ## test the operators and frames as clang compiles them; CLANG_CXX=clang++-16 is the compiler
+	@rm -rf $(CLANG)/darswin
+	@PATH=$(CURDIR)/$(BIN):$$PATH CXX=$(CLANG_CXX) DARSWIN_BUILD=cmake-clang \
+	  $(BIN)/python setup.py -q build --build-lib $(CLANG)
+	@cd $(CLANG); DARSWIN_BUILD=cmake-clang $(PYTEST) -q -c $(CURDIR)/pyproject.toml \
+	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py $(CURDIR)/tests/test_build.py
 
 fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
@@ -154,9 +165,17 @@ wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a f
 DEST := dist
 repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
-	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
+	  --exclude 'libtorch*' --exclude 'libc10*' "$(WHEEL)"
 
-published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
+# For systems without a wheel of their own: the operators run their PyTorch reference.
+PURE := build/pure
+pure-wheel: $(STAMP)  ## build the wheel for any system in dist/, which has no compiled modules, and test it
+	rm -rf build/lib $(PURE)
+	DARSWIN_PURE=1 $(BIN)/python -m build --no-isolation --wheel --outdir dist
+	$(BIN)/pip install -q --no-deps --target $(PURE) dist/darswin-*-py3-none-any.whl
+	PYTHONPATH=$(CURDIR)/$(PURE) $(BIN)/python tests/installed.py
+
+published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel: on Linux in the manylinux_2_28 container, which needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
 
 # The versions of torch to test the wheel of `make wheels` with, each in a fresh environment.

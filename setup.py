@@ -32,7 +32,7 @@ def pythons() -> str:
 
 class CMakeBuild(build_ext):
     def get_ext_filename(self, fullname):
-        if fullname.endswith("libdarswin"):
+        if fullname.rpartition(".")[2].startswith("libdarswin"):
             return fullname.replace(".", "/") + ".so"
         return super().get_ext_filename(fullname)
 
@@ -45,7 +45,7 @@ class CMakeBuild(build_ext):
             )
         output = Path(self.get_ext_fullpath("darswin.libdarswin")).resolve().parent
         sanitize = os.environ.get("DARSWIN_SANITIZE", "")
-        build = ROOT / "build" / ("cmake-sanitized" if sanitize else "cmake")
+        build = ROOT / "build" / os.environ.get("DARSWIN_BUILD", "cmake")
         subprocess.check_call(
             ["cmake", "--log-level=NOTICE", "-S", ROOT, "-B", build, "-G", "Ninja",
              f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja')}",
@@ -64,10 +64,12 @@ class PlatformWheel(bdist_wheel):
     wheel has a module darswin.frames._frames for each Python it was built for."""
 
     def get_tag(self):
-        return "py3", "none", super().get_tag()[2]
+        return "py3", "none", super().get_tag()[2]  # "any" if there are no modules
 
 
+pure = os.environ.get("DARSWIN_PURE") == "1"  # a wheel without compiled modules, for any system
+MODULES = ("libdarswin", "frames._frames", "frames.libdarswin_frames")
 setup(
-    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin.frames._frames", [])],
+    ext_modules=[] if pure else [Extension(f"darswin.{name}", []) for name in MODULES],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

@@ -7,6 +7,7 @@ All results are published, also those where a peer is faster.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,11 +17,21 @@ from darswin.bench import targets
 from darswin.bench.machine import THREADS, machine, num_threads, on_other_tiers
 from darswin.bench.plot import Rows, draw_panels, in_lines
 from darswin.bench.record import Record
-from darswin.bench.tables import by_case, markdown, milliseconds, ratios
-from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
+from darswin.bench.start import Start
+from darswin.bench.tables import (
+    by_case,
+    markdown,
+    milliseconds,
+    paced_table,
+    pivot,
+    ratios,
+    starts_table,
+)
+from darswin.bench.timing import DEFAULT, MATMULS, OURS, REFERENCE, Case, Timing, measure
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
+T = TypeVar("T")
 
 
 def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
@@ -98,11 +109,32 @@ def compare(
     return measure(case, steps, seconds, targets=targets)
 
 
+def on_torch_threads(run: Callable[[], T]) -> Callable[[int], Callable[[], T]]:
+    """A function for each number of threads, `DEFAULT` included, that calls `run` on so many of
+    torch's."""
+
+    def on(threads: int) -> Callable[[], T]:
+        def step() -> T:
+            if torch.get_num_threads() != (count := threads or max(THREADS)):
+                torch.set_num_threads(count)  # only before the first frame of a turn
+            return run()
+
+        return step
+
+    return on
+
+
 def run_suite(
-    suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
+    suite: str,
+    jobs: Sequence[Callable[[], list[Timing]]],
+    avx2_share: float,
+    out: Path | None,
+    paced: Sequence[Callable[[], list[Timing]]] = (),
+    starts: Sequence[Callable[[], list[Start]]] = (),
 ) -> list[Timing]:
-    """Runs jobs at one and at all threads, prints tables and targets, and writes the record and its
-    plot to the folder `out`. On the AVX2 tier, the targets are `avx2_share` of the others."""
+    """Runs jobs at one and at all threads, and those at the pace of a camera, which choose their
+    threads themselves; prints tables and targets, and writes the record and its plot to the folder
+    `out`. On the AVX2 tier, the targets are `avx2_share` of the others."""
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()))
     timings: list[Timing] = []
@@ -110,11 +142,20 @@ def run_suite(
         for threads in THREADS:
             with num_threads(threads):
                 timings += job()
+    for job in tqdm(paced, unit="case", desc="at a camera's pace", disable=not paced):
+        with num_threads(max(THREADS)):
+            timings += job()
+    started = [start for job in starts for start in job()]
     for subject in dict.fromkeys(t.subject for t in timings):
         print(peers_table(timings, subject), end="\n\n")
+    if paced:
+        print(paced_table(timings), end="\n\n")
+    if starts:
+        print(starts_table(started), end="\n\n")
     print(*targets.lines(timings, avx2_share), sep="\n")
+    print(*targets.paced_lines(timings), *targets.start_lines(started), sep="\n")
     if out:
-        Record(head, timings).publish(out, suite, draw_peers)
+        Record(head, timings, starts=started).publish(out, suite, draw_peers)
     return timings
 
 
@@ -146,10 +187,10 @@ def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = 
 
 
 def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
-    """A row a model and batch in float32, a column a peer with its time over ours."""
-    rows = []
+    """A row a model and batch in float32, in a loop; a column a peer with its time over ours."""
+    in_float32, rows = [t for t in timings if t.mode.startswith("forward, float32")], []
     for subject in dict.fromkeys(t.subject for t in timings):
-        chosen = [t for t in timings if t.subject == subject and "float32" in t.mode]
+        chosen = [t for t in in_float32 if t.subject == subject]
         for (setting, batch, _), found in by_case(chosen).items():
             over = [ratios(found.get(peer, ()), 2) for peer in peers]
             rows.append(
@@ -158,16 +199,38 @@ def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     return markdown(["", "ours (ms)", *peers], rows)
 
 
+def single_frames(timings: Sequence[Timing]) -> list[Timing]:
+    """One frame of one camera: at its pace, or in a loop in a record that has only that."""
+    chosen = [t for t in timings if t.batch == 1 and t.mode.endswith("fixed lens")]
+    return [t for t in chosen if t.paced] or chosen
+
+
 def latency_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     """The milliseconds of one frame: a row for each model and dtype, a column for each runtime."""
-    rows = []
-    for subject in dict.fromkeys(t.subject for t in timings):
-        chosen = [t for t in timings if t.subject == subject and t.batch == 1]
+    frames, rows = [t for t in single_frames(timings) if t.threads != DEFAULT], []
+    for subject in dict.fromkeys(t.subject for t in frames):
+        chosen = [t for t in frames if t.subject == subject]
         for (setting, _, mode), found in by_case(chosen).items():
             _, dtype, _ = mode.split(", ")
             times = [milliseconds(found.get(name, ())) for name in (OURS, *peers)]
             rows.append([f"`{subject}`, {setting}, {dtype}", *times])
     return markdown(["", "`optimize`", *peers], rows)
+
+
+def camera_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
+    """The ms of one frame in float32 with default threads, or with all in a record of loops alone:
+    a row for each runtime, a column for each model."""
+    frames = [t for t in single_frames(timings) if "float32" in t.mode]
+    paced = any(t.paced for t in frames)
+    threads = DEFAULT if paced else max(t.threads for t in frames)
+    return pivot(
+        f"one frame {'every 33 ms' if paced else 'in a loop'}: p50 (p99)",
+        (
+            (t.name, f"`{t.subject}`", f"{1e3 * t.median:.2f} ({1e3 * (t.p99 or 0):.2f})")
+            for t in frames
+            if t.threads == threads and t.name in (OURS, *peers)
+        ),
+    )
 
 
 def attention_table(timings: Sequence[Timing]) -> str:

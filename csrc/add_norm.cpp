@@ -11,9 +11,6 @@
 namespace darswin {
 namespace {
 
-// A thread should have at least this many values.
-constexpr int64_t kGrain = 8192;
-
 template <typename S, typename Out>
 void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const Tensor& bias,
          double eps) {
@@ -23,9 +20,10 @@ void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const 
   args.eps = static_cast<float>(eps);
   args.width = weight.numel();
   if (x.numel() == 0) return;
-  const int64_t rows = x.numel() / args.width, each = std::max<int64_t>(kGrain / args.width, 1);
-  parallel_ranges(units(rows, each), [&](int64_t begin, int64_t end) {
-    kernels<AddNormKernels<S, Out>>().rows(args, begin * each, std::min(end * each, rows));
+  constexpr double kPerMicrosecond = 4000;  // values
+  const Threads threads = threads_for(static_cast<double>(x.numel()) / kPerMicrosecond);
+  parallel_ranges(x.numel() / args.width, threads, [&](int64_t begin, int64_t end) {
+    kernels<AddNormKernels<S, Out>>().rows(args, begin, end);
   });
 }
 

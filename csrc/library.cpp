@@ -50,9 +50,7 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "
       "float eps=1e-05) -> Tensor");
-  m.def(
-      "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "
-      "int mlp_dim, float eps) -> ()");
+  m.def("_run(Tensor[] inputs, Tensor weights, int[] program) -> Tensor[]");
 }
 
 namespace {
@@ -83,10 +81,23 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
+// Says whether 8-bit layers may use the CPU's products of four bytes, as they do at first. The
+// results are the same. Returns true if they use them now.
+FACT bool darswin_allow_fours(bool allowed) {
+  darswin::allow_fours(allowed);
+  return darswin::has_fours();
+}
+
+#if defined(__clang__)
+#  define COMPILER "clang++ " __clang_version__
+#else
+#  define COMPILER "g++ " __VERSION__
+#endif
+
+// The compiler, the C++ standard and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
-  static const std::string info =
-      R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" + std::to_string(__cplusplus) +
-      R"(, "openmp": )" + std::to_string(_OPENMP) + R"(, "torch_abi": "stable, torch>=2.10"})";
+  static const std::string info = R"({"compiler": ")" COMPILER R"(", "cxx_standard": )" +
+                                  std::to_string(__cplusplus) +
+                                  R"(, "torch_abi": "stable, torch>=2.10"})";
   return info.c_str();
 }

@@ -67,9 +67,10 @@ struct LinearArgs {
 
 template <typename X>
 struct LinearKernels {
-  // Computes the columns of panels [first, last) of rows [begin, end). For uint8_t, this is null on
-  // tiers below avx512, and needs a CPU with VNNI.
-  void (*rows)(const LinearArgs<X>&, int64_t begin, int64_t end, int64_t first, int64_t last);
+  // Computes the columns of panels [first, last) of rows [begin, end).
+  using Rows = void(const LinearArgs<X>&, int64_t begin, int64_t end, int64_t first, int64_t last);
+  Rows* rows;
+  Rows* by_fours;  // the same with the CPU's products of four bytes; null on tiers without any
 };
 
 }  // namespace darswin

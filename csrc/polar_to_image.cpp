@@ -6,8 +6,7 @@
 #include <vector>
 
 #include "checks.h"
-#include "core/dispatch.h"
-#include "core/parallel.h"
+#include "core/to_image.h"
 
 namespace darswin {
 namespace {
@@ -105,10 +104,7 @@ struct ToImageCall {
     return {args.batch, args.channels, args.height, args.width};
   }
 
-  int64_t threads() const {
-    const double pixels = static_cast<double>(args.height) * args.width;
-    return threads_for(sampling_microseconds(args.batch * pixels, args.channels));
-  }
+  Threads threads() const { return polar_to_image_threads(args); }
 
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
@@ -134,14 +130,7 @@ Tensor forward(ToImageCall<T>&& call) {
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
-  // Images with the same lens take turns, band by band, so that all of them use one plan of a band.
-  // With few channels, low bands are faster, because their plan stays in the cache. With more, high
-  // bands are up to 12 % faster, because the map and the pages of the image stay there instead.
-  const int64_t items = 4 * call.threads();
-  const int64_t most = args.batch == 1 ? 1 : args.channels <= 4 ? 64 : args.height;
-  const int64_t rows = std::clamp<int64_t>(args.height * args.batch / items, 1, most);
-  args.bands = units(args.height, rows);
-  call.run(args.batch * args.bands, kernels<PolarToImageKernels<T>>().forward);
+  run_polar_to_image(args);
   return out;
 }
 

@@ -14,6 +14,8 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "studies"), str(ROOT / "benchmarks")]
 
+import peers  # noqa: E402
+
 from darswin.bench import tables as bench  # noqa: E402
 from darswin.bench.record import Record  # noqa: E402
 from darswin.bench.timing import OURS, Timing  # noqa: E402
@@ -40,8 +42,6 @@ README_SPEED = (
     ("polar_sample", "forward", "256×256", 8),
     ("polar_sample", "forward+backward", "256×256", 8),
     ("polar_to_image", "forward", "64×256 → 256×256", 2),
-    ("window_attention", "forward+backward", "A stage 1", 32),
-    ("darswin_a_small", "inference, float32", "64×64", 1),
     ("darswin_a_small", "inference, float32", "64×64", 8),
     ("darswin_a_small", "inference, int8", "64×64", 8),
     ("darswin_a_small", "training, float32", "64×64", 8),
@@ -49,6 +49,8 @@ README_SPEED = (
 SPEED = (
     *README_SPEED,
     ("window_attention", "forward", "A stage 1", 32),
+    ("window_attention", "forward+backward", "A stage 1", 32),
+    ("darswin_a_small", "inference, float32", "64×64", 1),
     ("darswin_a_small", "inference, bfloat16", "64×64", 8),
 )
 
@@ -72,19 +74,21 @@ def drop_in_line(timings: Sequence[Timing]) -> str:
 
 
 def frame_line(timings: Sequence[Timing]) -> str:
-    """Sentences on the times of peers and of float32 for one frame, on one thread."""
-    frames = [t for t in timings if t.batch == 1 and t.threads == 1]
-    chosen = [t for t in frames if "float32" in t.mode]
-    parts = []
+    """Sentences on the times of peers, and of float32 for int8, for one frame on one thread."""
+    frames = [t for t in peers.single_frames(timings) if t.threads == 1]
+    chosen, parts = [t for t in frames if "float32" in t.mode], []
     for peer in FRAME_PEERS[1:]:
         found = [t.ratio for t in chosen if t.name == peer]
         parts.append(f"{min(found):.1f} to {max(found):.1f} times as fast as the {peer}")
     parts[:2] = [part.replace("the ", "") for part in parts[:2]]
     first, *others = parts
-    int8 = [f"`{t.subject}` is {t.ratio:.1f} times" for t in frames if t.name == "float32"]
+    in_int8 = [t for t in timings if (t.name, t.batch, t.threads) == ("float32", 1, 1)]
+    int8 = [f"`{t.subject}` is {t.ratio:.1f} times" for t in in_int8]
+    how = "at a camera's pace" if frames[0].paced else "in a loop"
     return (
-        f"For one frame on one core, these models are {first}.\nThey are {' and '.join(others)}.\n"
-        f"In int8, {' and '.join(int8)} as fast as in float32."
+        f"For one frame on one core, {how}, these models are {first}.\n"
+        f"They are {' and '.join(others)}.\n"
+        f"In a loop, {' and '.join(int8)} as fast in int8 as in float32."
     )
 
 
@@ -92,10 +96,15 @@ def frames_table(timings: Sequence[Timing]) -> str:
     """A row for each size of frames and samples: our time, and the peers' times over it."""
     peers = [name for name in dict.fromkeys(t.name for t in timings) if name != OURS]
     rows = []
-    for (setting, *_), found in bench.by_case(timings).items():
+    for (setting, *_), found in bench.by_case(t for t in timings if not t.paced).items():
         ours = " / ".join(f"{1e6 * t.median:.3g}" for t in found[OURS])
         rows.append([setting, ours, *(bench.ratios(found[peer]) for peer in peers)])
     return bench.markdown(["frame → samples", "ours (µs)", *peers], rows)
+
+
+def if_measured(table: str) -> str:
+    """A table, or that it is empty because the record is older than it."""
+    return table if table.count("\n") > 1 else "The record is older than this measurement."
 
 
 def demo_table(record: dict) -> str:
@@ -123,7 +132,6 @@ def tables() -> dict[str, str]:
     """All tables, by the name of their place in a page."""
     import dense_tables
     import learned_tables
-    import peers
     import pretrained_tables
     import sizes_tables
     import tables as study
@@ -137,6 +145,7 @@ def tables() -> dict[str, str]:
         cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
         for cpu in CPUS.values()
     }
+    single = peers.single_frames(one_frame.timings)
     demo = json.loads((ROOT / "docs" / "accuracy.json").read_text())
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
@@ -156,6 +165,13 @@ def tables() -> dict[str, str]:
         "model": bench.models_table(model.timings),
         "frame line": frame_line(one_frame.timings),
         "latency": peers.latency_table(one_frame.timings, FRAME_PEERS[1:]),
+        "camera": peers.camera_table(one_frame.timings, FRAME_PEERS[1:2]),
+        "paced": if_measured(bench.paced_table(single)),
+        "from frame": if_measured(
+            bench.paced_table(t for t in one_frame.timings if t not in single)
+        ),
+        "starts": if_measured(bench.starts_table(one_frame.starts)),
+        "frames paced": if_measured(bench.paced_table(frames.timings)),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),
         "model int8": bench.quantized_table(model.timings),

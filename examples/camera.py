@@ -1,13 +1,17 @@
 """Classifies the frames of a video without torch, and prints the classes and the speed.
 
-    python examples/camera.py VIDEO --plan camera.npz --graph camera.onnx [--threads N] [--every N]
+    python examples/camera.py VIDEO [--network camera.npz] [--threads N] [--every N]
 
-Only NumPy, OpenCV, onnxruntime and darswin.frames run here. The two files are made once, where
-torch is installed. The frames of the video must have the size of the plan:
+Only NumPy, OpenCV and darswin.frames run here. The file is made once, where torch is installed. The
+frames of the video must have its size:
 
     model, card = darswin.models.load_model("runs/camera/checkpoints/best.safetensors")
     lens = darswin.lens.load("calibration.json")
-    darswin.frames.plan(model, lens, (1080, 1920)).save("camera.npz")
+    darswin.frames.export(model, lens, (1080, 1920), "camera.npz")
+
+ONNX Runtime can run the network instead: `--graph camera.onnx --plan plan.npz`, with these files:
+
+    darswin.frames.plan(model, lens, (1080, 1920)).save("plan.npz")
     images = torch.zeros(1, 3, 1080, 1920, dtype=torch.uint8)
     export_onnx(model, "camera.onnx", images, lens, fixed_lens=True, input="tokens")
 """
@@ -15,26 +19,50 @@ torch is installed. The frames of the video must have the size of the plan:
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import onnxruntime
 
-from darswin.frames import Sampler
+from darswin.frames import Network, Sampler
 
 
-def session_of(path: str, threads: int) -> onnxruntime.InferenceSession:
-    """The graph in a file of `export_onnx(..., input="tokens")`."""
-    options = onnxruntime.SessionOptions()
+class Classifier(NamedTuple):
+    run: Callable[[np.ndarray], np.ndarray]  # from a frame to a score for each class
+    gray: bool  # whether the frames are gray
+    labels: Sequence[str] = ()
+
+
+def by_darswin(path: str, threads: int) -> Classifier:
+    """The network in a file of `darswin.frames.export`."""
+    network = Network(path)
+    if [len(shape) for shape in network.shapes] != [1]:
+        sys.exit(f"{path} is no classifier: it returns arrays of the shapes {network.shapes}")
+    return Classifier(
+        lambda frame: network(frame, threads=threads), network.channels == 1, network.labels
+    )
+
+
+def by_onnx_runtime(graph: str, plan: str, threads: int) -> Classifier:
+    """The graph in a file of `export_onnx(..., input="tokens")`, on the samples of a plan."""
+    import onnxruntime
+
+    sampler, options = Sampler(plan), onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     try:
-        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class of its own for each kind of failure
-        sys.exit(f"{path} is no ONNX file that onnxruntime can run: {error}")
+        sys.exit(f"{graph} is no ONNX file that onnxruntime can run: {error}")
     if [put.name for put in session.get_inputs()] != ["tokens"]:
-        sys.exit(f'{path} is no graph of a darswin model: write it with input="tokens"')
-    return session
+        sys.exit(f'{graph} is no graph of a darswin model: write it with input="tokens"')
+
+    def run(frame: np.ndarray) -> np.ndarray:
+        (logits,) = session.run(["logits"], {"tokens": sampler(frame, threads=threads)[None]})
+        return logits[0]
+
+    # A token has the samples of one channel or of three.
+    return Classifier(run, session.get_inputs()[0].shape[-1] == sampler.plan.right[0, 0].size)
 
 
 def frames_of(path: str, gray: bool) -> Iterator[np.ndarray]:
@@ -46,45 +74,41 @@ def frames_of(path: str, gray: bool) -> Iterator[np.ndarray]:
         found, frame = video.read()
         if not found:
             return
-        # The sampler reads BGR as RGB: the order of the channels is only a stride.
+        # Network and sampler read BGR as RGB: the order of the channels is only a stride.
         yield cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if gray else frame[..., ::-1]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("video", help="a video file")
-    parser.add_argument("--plan", default="camera.npz", help="the file of `darswin.frames.plan`")
-    parser.add_argument("--graph", default="camera.onnx", help="the file of `export_onnx`")
-    parser.add_argument("--threads", type=int, default=1, help="threads of sampler and network")
+    parser.add_argument("--network", default="camera.npz", help="a file of darswin.frames.export")
+    parser.add_argument("--graph", help="a file of `export_onnx`, for ONNX Runtime")
+    parser.add_argument("--plan", default="plan.npz", help="with a graph: its plan")
+    parser.add_argument("--threads", type=int, default=1, help="the most threads to use")
     parser.add_argument("--every", type=int, default=30, help="print every N-th frame's class")
     args = parser.parse_args()
     try:
-        sampler = Sampler(args.plan)
+        if args.graph is None:
+            classifier = by_darswin(args.network, args.threads)
+        else:
+            classifier = by_onnx_runtime(args.graph, args.plan, args.threads)
     except (ValueError, OSError) as error:
         sys.exit(str(error))
-    session = session_of(args.graph, args.threads)
-    # A token has the samples of one channel or of three.
-    gray = session.get_inputs()[0].shape[-1] == sampler.plan.right[0, 0].size
-    sampling, network, count = 0.0, 0.0, 0
-    for frame in frames_of(args.video, gray):
+    seconds = []
+    for frame in frames_of(args.video, classifier.gray):
         start = time.perf_counter()
         try:
-            tokens = sampler(frame, threads=args.threads)
+            best = int(classifier.run(frame).argmax())
         except ValueError as error:
             sys.exit(f"{args.video}: {error}")
-        sampled = time.perf_counter()
-        (logits,) = session.run(["logits"], {"tokens": tokens[None]})
-        sampling, network = sampling + sampled - start, network + time.perf_counter() - sampled
-        if count % args.every == 0:
-            print(f"frame {count}: class {logits.argmax()}")
-        count += 1
-    if not count:
+        seconds.append(time.perf_counter() - start)
+        if (number := len(seconds) - 1) % args.every == 0:
+            name = classifier.labels[best] if classifier.labels else best
+            print(f"frame {number}: class {name}")
+    if not seconds:
         sys.exit(f"{args.video} has no frames")
-    sampling, network = 1e3 * sampling / count, 1e3 * network / count  # ms per frame
-    print(
-        f"{1e3 / (sampling + network):.0f} frames per second: "
-        f"sampling {sampling:.2f} ms, network {network:.2f} ms per frame"
-    )
+    mean, longest = 1e3 * np.mean(seconds), 1e3 * np.max(seconds)
+    print(f"{1e3 / mean:.0f} frames per second: {mean:.2f} ms per frame, {longest:.2f} ms at most")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Each cell trains a model of `study.py`, unless that study has done so, and runs `darswin quantize`.
 The ranges come from training pictures through the lenses of training. Both models are tested on the
 same pictures. The folder of a cell keeps its results, so a study that was stopped can go on. Run it
-with `make study-int8`, on a CPU with VNNI.
+with `make study-int8`.
 """
 
 import argparse

@@ -13,6 +13,24 @@ def random_frame(height, width, *channels, seed=0):
     return rng.integers(0, 256, (height, width, *channels), dtype=np.uint8)
 
 
+def in_layout(frame, kind):
+    """The same frame in another memory layout."""
+    if kind == "flipped":
+        return np.ascontiguousarray(frame[::-1, ::-1])[::-1, ::-1]
+    if kind == "gaps":
+        room = np.zeros((frame.shape[0] * 2, frame.shape[1] + 5, *frame.shape[2:]), np.uint8)
+        room[1::2, 3:-2] = frame
+        return room[1::2, 3:-2]
+    if kind == "bgr" and frame.ndim == 3:
+        return np.ascontiguousarray(frame[..., ::-1])[..., ::-1]
+    if kind == "planes" and frame.ndim == 3:
+        return np.ascontiguousarray(frame.transpose(2, 0, 1)).transpose(1, 2, 0)
+    return np.asfortranarray(frame) if kind == "turned" else frame
+
+
+LAYOUTS = ("plain", "flipped", "gaps", "bgr", "planes", "turned")
+
+
 def bilinear(image, x, y):
     """Bilinear samples of (H, W, C) in float64, with 0 outside."""
     padded = np.pad(image.astype(np.float64), ((2, 2), (2, 2), (0, 0)))

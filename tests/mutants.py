@@ -32,7 +32,7 @@ NO_TESTS = 5  # pytest's exit code if it finds none
 SLOW = "slow: "  # starts the result of a mutant that only slow tests notice
 # The folders of tests for each folder of code, the nearest first.
 TESTS = {
-    "csrc": ["ops", "test_frames.py", "test_frame_pictures.py"],
+    "csrc": ["ops", "test_frames.py", "test_frame_networks.py", "test_frame_pictures.py"],
     "darswin/ops": ["ops", "layers"],
     "darswin/lens": ["lens", "layers", "models"],
     "darswin/layers": ["layers", "models"],

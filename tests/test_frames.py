@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
+from frame_samples import LAYOUTS, MEAN, ROUND, STD, bilinear, in_layout, random_frame
 from helpers import CAMERAS
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ from lens_examples import RANDOM, random_lens
 
 from darswin import create_model, frames, list_models
 from darswin.compat import OfficialDarSwin
-from darswin.frames import _frames
+from darswin.frames import _frames, plans
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
 from darswin.models.encoder import Encoder
@@ -29,24 +29,6 @@ from darswin.views import PolarView, make_view
 
 def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
     return PolarView(rings, sectors, samples, layout=layout, mean=mean, std=std, **options).eval()
-
-
-def in_layout(frame, kind):
-    """The same frame in another memory layout."""
-    if kind == "flipped":
-        return np.ascontiguousarray(frame[::-1, ::-1])[::-1, ::-1]
-    if kind == "gaps":
-        room = np.zeros((frame.shape[0] * 2, frame.shape[1] + 5, *frame.shape[2:]), np.uint8)
-        room[1::2, 3:-2] = frame
-        return room[1::2, 3:-2]
-    if kind == "bgr" and frame.ndim == 3:
-        return np.ascontiguousarray(frame[..., ::-1])[..., ::-1]
-    if kind == "planes" and frame.ndim == 3:
-        return np.ascontiguousarray(frame.transpose(2, 0, 1)).transpose(1, 2, 0)
-    return np.asfortranarray(frame) if kind == "turned" else frame
-
-
-LAYOUTS = ("plain", "flipped", "gaps", "bgr", "planes", "turned")
 
 
 @st.composite
@@ -420,11 +402,11 @@ def test_values_that_were_not_written_are_refused(name, tmp_path):
 def test_a_file_of_version_1_is_read(normalize_first, tmp_path):
     path, frame = tmp_path / "camera.npz", random_frame(50, 60, 3)
     content = dict(vars(PLAN), darswin_plan=1, normalize_first=normalize_first)
-    np.savez(path, **content, digest=frames._digest(content))
+    np.savez(path, **content, digest=plans._digest(content))
     assert frames.Plan.load(path) == PLAN
     np.testing.assert_array_equal(frames.Sampler(path)(frame), frames.Sampler(PLAN)(frame))
     damaged = dict(content, normalize_first=not normalize_first)
-    np.savez(path, **damaged, digest=frames._digest(content))
+    np.savez(path, **damaged, digest=plans._digest(content))
     with pytest.raises(ValueError, match="is a damaged plan"):
         frames.Plan.load(path)
 

@@ -59,6 +59,21 @@ def test_public_names_load_nothing_heavy(code, with_torch):
 
 
 @pytest.mark.slow
+def test_every_module_for_inference_may_be_the_first_one():
+    names = sorted(path.stem for path in Path(darswin.__file__).parent.glob("deploy/[a-z]*.py"))
+    assert "optimize" in names
+    code = f"""
+import os, torch
+for name in {names}:
+    if not (process := os.fork()):
+        __import__(f"darswin.deploy.{{name}}")
+        os._exit(0)
+    assert os.waitpid(process, 0)[1] == 0, name
+"""
+    loaded(code)
+
+
+@pytest.mark.slow
 def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
     modules = loaded("import torch" + COMMAND.format(["lens", "info", str(LENS)]))
     assert "darswin.viz.report" in modules

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parent.parent
+TARGETS = {*re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M)}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -43,14 +44,29 @@ def test_the_conda_recipe_is_of_this_version():
     assert {*needed["build"], *needed["host"]} >= in_conda(PROJECT["build-system"]["requires"])
 
 
+def test_ci_runs_targets_of_make():
+    ci = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    rows = ci["jobs"]["make"]["strategy"]["matrix"]["include"]
+    assert {target for row in rows for target in row["targets"].split()} <= TARGETS
+    assert {row["machine"] for row in rows} == {"ubuntu-24.04", "ubuntu-24.04-arm"}
+
+
+def test_every_other_python_is_found_where_wheels_are_built():
+    """cibuildwheel itself does not replace `*` and `[1-4]` in the result of a command."""
+    settings = PROJECT["tool"]["cibuildwheel"]
+    for environment in (settings["environment"], settings["macos"]["environment"]):
+        assert re.fullmatch(r"\$\(sh -c 'echo \S*\*?\S+'\)", environment["DARSWIN_PYTHONS"])
+
+
 def test_a_tag_publishes_what_make_builds():
     release = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
     assert release[True]["push"] == {"tags": ["v*"]}  # YAML reads `on` as True
     assert release["permissions"] == {"contents": "read"}
     build, publish = release["jobs"]["build"], release["jobs"]["publish"]
-    targets = {row["target"] for row in build["strategy"]["matrix"]["include"]}
-    declared = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M)
-    assert targets == {"sdist", "published-wheels"} and targets <= {*declared}
+    rows = build["strategy"]["matrix"]["include"]
+    assert {row["target"] for row in rows} == {"sdist", "published-wheels", "pure-wheel"} <= TARGETS
+    wheels = {row["machine"] for row in rows if row["target"] == "published-wheels"}
+    assert wheels == {"ubuntu-24.04", "ubuntu-24.04-arm", "macos-14"}
     assert publish["needs"] == "build" and publish["if"] == "github.ref_type == 'tag'"
     assert publish["permissions"] == {"id-token": "write"}
     *_, last = publish["steps"]

@@ -12,11 +12,9 @@ import pytest
 import quantized
 import study
 import tables
-import torch
 from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, augmented, headline
 
 from darswin import create_model
-from darswin.layers.linear import onednn_lack
 
 QUICK = """
     --data.path digits --data.limit 96 --data.batch_size 16 --trainer.max_epochs 1 --data.render 32
@@ -152,7 +150,6 @@ def test_tables_and_picture(quick):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="no products of 8 bits")
 def test_cells_of_8_bits(quick, here):
     where = ["--out", str(quick / "out"), "--results", str(quick)]
     how = [*where, "--seeds", "1", "--cell", "dat", "--test-images", "20", "--pictures", "8"]

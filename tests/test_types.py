@@ -25,7 +25,7 @@ CMAKE = """#!/bin/sh
 for word in "$@"; do case "$word" in -DDARSWIN_OUTPUT_DIR=*)
   mkdir -p "${word#*=}/frames"
   cp -n darswin/libdarswin.so "${word#*=}"
-  cp -n darswin/frames/_frames.*.so "${word#*=}/frames"
+  cp -n darswin/frames/*.so "${word#*=}/frames"
 esac; done
 """
 CODE = """

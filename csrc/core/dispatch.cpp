@@ -2,6 +2,12 @@
 // never raise it above the CPU's best.
 #include "dispatch.h"
 
+#if defined(__x86_64__)
+#  include <cpuid.h>
+#elif defined(__aarch64__) && defined(__linux__)
+#  include <sys/auxv.h>
+#endif
+
 #include <atomic>
 #include <cstdlib>
 #include <cstring>
@@ -41,6 +47,21 @@ Tier initial() {
 }
 
 std::atomic<Tier> current{initial()};
+std::atomic<bool> fours{true};
+
+bool cpu_has_fours([[maybe_unused]] Tier tier) {
+#if defined(__x86_64__)
+  if (tier == Tier::avx512) return __builtin_cpu_supports("avx512vnni");
+  unsigned a = 0, b = 0, c = 0, d = 0;  // compilers do not know the name of AVX-VNNI yet
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) && (a >> 4 & 1);
+#elif defined(__aarch64__) && defined(__linux__)
+  return (getauxval(AT_HWCAP) & HWCAP_ASIMDDP) != 0;
+#elif defined(__aarch64__) && defined(__APPLE__)
+  return true;
+#else
+  return false;
+#endif
+}
 
 }  // namespace
 
@@ -52,13 +73,13 @@ bool cpu_is_intel() {
 #endif
 }
 
-bool cpu_has_vnni() {
-#if defined(__x86_64__)
-  return __builtin_cpu_supports("avx512vnni");
-#else
-  return false;
-#endif
+bool has_fours() {
+  static const bool avx512 = cpu_has_fours(Tier::avx512), others = cpu_has_fours(Tier::avx2);
+  return fours.load(std::memory_order_relaxed) &&
+         (current_tier() == Tier::avx512 ? avx512 : others);
 }
+
+void allow_fours(bool allowed) { fours.store(allowed, std::memory_order_relaxed); }
 
 Tier current_tier() { return current.load(std::memory_order_relaxed); }
 

@@ -16,7 +16,11 @@ std::vector<Tier> available_tiers();  // this build's tiers that the CPU has, lo
 bool set_tier(const char* name);      // false if the CPU or the build lacks that tier
 
 bool cpu_is_intel();
-bool cpu_has_vnni();  // of AVX-512
+
+// Returns true if this CPU has the tier's instruction for the products of four bytes, unless
+// allow_fours(false) was called.
+bool has_fours();
+void allow_fours(bool allowed);
 
 template <typename Table, Tier... tiers>
 const Table* find_table(Tier tier) {

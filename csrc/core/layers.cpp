@@ -28,12 +28,13 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
   } else {
     args.out = static_cast<float*>(out);
   }
-  const auto& kernel = kernels<LinearKernels<X>>().rows;
+  const auto& table = kernels<LinearKernels<X>>();
+  const auto kernel = table.by_fours != nullptr && has_fours() ? table.by_fours : table.rows;
   constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
   // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
   constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
   const double work = static_cast<double>(rows) * depth * columns;
-  const int64_t threads = threads_for(work / kPerMicrosecond);
+  const Threads threads = threads_for(work / kPerMicrosecond);
   const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
@@ -56,7 +57,7 @@ void normalize_rows(const float* x, int64_t rows, const Norm& norm, Out* out, Qu
                                      .width = norm.dim,
                                      .quantizer = quantizer};
   constexpr double kPerMicrosecond = 4000;  // numbers
-  const int64_t threads = threads_for(static_cast<double>(rows) * norm.dim / kPerMicrosecond);
+  const Threads threads = threads_for(static_cast<double>(rows) * norm.dim / kPerMicrosecond);
   parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
     kernels<AddNormKernels<float, Out>>().rows(args, begin, end);
   });
@@ -75,10 +76,6 @@ Layer::Layer(const void* packed_, int64_t depth_, int64_t columns_, bool is_quan
   const auto* last = static_cast<const int32_t*>(packed) + words(depth, columns, true) - kLastWords;
   scale = std::bit_cast<float>(last[0]);
   quantizer = {std::bit_cast<float>(last[1]), last[2]};
-}
-
-bool has_quantized_layers() {
-  return kernels<LinearKernels<uint8_t>>().rows != nullptr && cpu_has_vnni();
 }
 
 void multiply(const void* x, int64_t rows, const Layer& layer, void* out, After after,

@@ -16,15 +16,13 @@ struct Layer {
   float scale = 1;           // of a step of its tokens
   Quantizer quantizer = {};  // of its tokens
 
+  Layer() = default;
   // The layer whose words are at `packed`.
   Layer(const void* packed, int64_t depth, int64_t columns, bool is_quantized);
 
   // The number of words of 32 bits of a layer.
   static int64_t words(int64_t depth, int64_t columns, bool is_quantized);
 };
-
-// Returns true if this tier and this CPU have products of 8 bits.
-bool has_quantized_layers();
 
 // A layer norm: its weight, then its bias, of `dim` numbers each.
 struct Norm {

@@ -1,8 +1,7 @@
-// OpenMP over contiguous ranges, and working memory for each thread. With these, every driver is
+// Threads over contiguous ranges, and working memory for each thread. With these, every driver is
 // fast and still gives the same bits for any number of threads.
 #pragma once
 
-#include <omp.h>
 #if defined(__linux__)
 #  include <sys/mman.h>
 #endif
@@ -10,9 +9,10 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
-#include <exception>
+#include <limits>
 #include <memory>
 #include <new>
+#include <type_traits>
 #include <utility>
 
 namespace darswin {
@@ -35,10 +35,11 @@ inline void ask_for_large_pages(void* memory, size_t bytes) {
 // Working memory of the calling thread, for the lifetime of this object. It has at least `bytes`
 // bytes, is aligned to cache lines and is not initialized. Up to kKept bytes stay with the thread
 // between uses, because fresh pages cost more than the work of the kernels in them. So a thread can
-// have only one of these objects at a time. Throws std::bad_alloc.
-class ThreadMemory {
+// have only one of these objects of each kind at a time. Throws std::bad_alloc.
+template <int kKind>
+class ThreadMemoryOf {
  public:
-  explicit ThreadMemory(size_t bytes) {
+  explicit ThreadMemoryOf(size_t bytes) {
     if (bytes <= size) return;
     free();
     if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
@@ -47,10 +48,10 @@ class ThreadMemory {
     ask_for_large_pages(memory.get(), bytes);
     size = bytes;
   }
-  ~ThreadMemory() {
+  ~ThreadMemoryOf() {
     if (size > kKept) free();
   }
-  ThreadMemory(const ThreadMemory&) = delete;
+  ThreadMemoryOf(const ThreadMemoryOf&) = delete;
 
   void* get() const { return memory.get(); }
 
@@ -72,6 +73,7 @@ class ThreadMemory {
   static inline thread_local std::unique_ptr<void, Free> memory;
   static inline thread_local size_t size = 0;
 };
+using ThreadMemory = ThreadMemoryOf<0>;
 
 // The number of threads that the caller allows: that of the innermost ThreadLimit of this thread,
 // else that of `thread_setting`.
@@ -92,13 +94,21 @@ class ThreadLimit {
   int64_t before;
 };
 
-// Returns the number of threads that is worth starting for so many microseconds of work. The second
-// thread takes about two microseconds to begin, and more if it has fallen asleep.
-inline int64_t threads_for(double microseconds) {
+// The number of threads of a call, and about how long one thread alone would take.
+struct Threads {
+  int64_t count;
+  double microseconds = std::numeric_limits<double>::max();
+
+  operator int64_t() const { return count; }
+};
+
+// Returns the number of threads that is worth using for so many microseconds of work. A helper that
+// is awake takes about a microsecond to begin. parallel.cpp decides whether to wake one.
+inline Threads threads_for(double microseconds) {
   constexpr double kLeast = 10;  // microseconds for each thread
   const double most = std::max(microseconds / kLeast, 1.0);
   const int64_t threads = num_threads();
-  return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
+  return {most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads, microseconds};
 }
 
 // Returns an estimate of the microseconds that it takes to sample so many points or pixels. On a
@@ -109,37 +119,26 @@ inline double sampling_microseconds(double count, int64_t channels) {
   return count * static_cast<double>(channels + 4) / kPerMicrosecond;
 }
 
-// Calls body(begin, end) on contiguous ranges that cover [0, count), each in its own thread. An
-// exception must not leave an OpenMP region. So it is stored, and thrown again when all threads
-// have ended.
+// Calls body(context, begin, end) as parallel_ranges does.
+using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
+void run_ranges(int64_t count, Threads threads, RangeBody body, void* context);
+
+// Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. A
+// thread may take several ranges. The first exception of a range is thrown again when all ranges
+// that began have ended; further ones need not begin.
 template <typename Body>
-void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
+void parallel_ranges(int64_t count, Threads threads, Body&& body) {
   if (count <= 0) return;
-  threads = std::min(count, threads);
-  std::exception_ptr failure;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-  {
-    const int64_t thread = omp_get_thread_num(), team = omp_get_num_threads();
-    const int64_t each = count / team, extra = count % team;
-    const int64_t begin = thread * each + std::min(thread, extra);
-    const int64_t end = begin + each + (thread < extra ? 1 : 0);
-    try {
-      if (begin < end) body(begin, end);
-    } catch (...) {
-#pragma omp critical(darswin_failure)
-      failure = std::current_exception();
-    }
-  }
-  if (failure != nullptr) std::rethrow_exception(failure);
-}
-template <typename Body>
-void parallel_ranges(int64_t count, Body&& body) {
-  parallel_ranges(count, num_threads(), std::forward<Body>(body));
+  if (count == 1 || threads.count <= 1) return body(int64_t{0}, count);
+  const auto call = [](void* context, int64_t begin, int64_t end) {
+    (*static_cast<std::remove_reference_t<Body>*>(context))(begin, end);
+  };
+  run_ranges(count, threads, call, const_cast<void*>(static_cast<const void*>(&body)));
 }
 
 // Calls body(begin, end, scratch) in the same way. Each thread gets `bytes` of working memory.
 template <typename Body>
-void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body) {
+void run_with_scratch(int64_t count, Threads threads, int64_t bytes, Body&& body) {
   parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {
     const ThreadMemory scratch(bytes);
     body(begin, end, scratch.get());

@@ -66,6 +66,7 @@ struct Sum {
 template <typename S, typename Out>
 void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
   const Quantize quantize(a.quantizer);
+  const float *const weight = a.weight, *const bias = a.bias;  // which bytes in `out` do not change
   const float part = 1 / static_cast<float>(a.width);
   for (int64_t row = begin; row < end; ++row) {
     S* x = a.x + row * a.width;
@@ -90,7 +91,7 @@ void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
     const float shift = more * scale;
     along(a.width, [&]<typename V>(int64_t c, int) {
       const V unit = (load<V>(x + c) - mean) * scale - shift;
-      const V normalized = unit * load<V>(a.weight + c) + load<V>(a.bias + c);
+      const V normalized = unit * load<V>(weight + c) + load<V>(bias + c);
       if constexpr (is_same_v<Out, uint8_t>) {
         quantize(out + c, normalized);
       } else {

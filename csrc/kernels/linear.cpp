@@ -9,45 +9,87 @@
 // before the next part starts. Every sum is taken in the same order wherever its tile lies. So the
 // results do not depend on the number of tokens or threads.
 //
-// With 8 bits, a number of a token is a word of four depths. The sums are integers, so they are
-// exact.
+// With 8 bits, a number of a token is a word of four depths, if the CPU adds the products of four
+// bytes in one instruction. Other CPUs add the products of two numbers of 16 bits. For them, a word
+// is split into two words of two depths: those of a part of the weights once for all tokens, and
+// those of a few tokens once for all columns of a panel. Either way the sums are integers and
+// exact, so the results are the same.
 #include "../linear.h"
 
-#include "math.h"
+#include "activations.h"
 #include "quantize.h"
 
 namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-constexpr int64_t kPart = 128;  // words of the depth; this part of a panel has 24 KB
+constexpr int64_t kPart = 128;  // words of a token in a tile; this part of a panel has 24 KB
 constexpr int64_t kMostRows = 128, kBlockBytes = 1 << 18;  // of a block of tokens
 
-// By the type of the tokens: the type of a word of the weights, and a register of sums.
-template <typename X>
-using Word = std::conditional_t<is_same_v<X, float>, float, uint32_t>;
-template <typename X>
-using Sums = Vector<std::conditional_t<is_same_v<X, float>, float, int32_t>, kL>;
+// The kinds of products. X is the type of a token's numbers, Word that of a word in a tile, and Sum
+// that of a sum. A word of the layer becomes kSplit words in a tile. If kCopies, a tile reads a
+// copy of its tokens.
+struct Numbers {
+  using X = float;
+  using Word = float;
+  using Sum = float;
+  static constexpr int64_t kSplit = 1;
+  static constexpr bool kCopies = false;
+  static Floats add(Floats sums, Floats x, Floats weights) { return sums + x * weights; }
+};
+
+struct Bytes {
+  using X = uint8_t;
+  using Word = uint32_t;
+  using Sum = int32_t;
+};
+
+// Four bytes in a word. If the CPU's bytes are signed, the copy of a token is 128 less.
+struct Fours : Bytes {
+  static constexpr int64_t kSplit = 1;
+  static constexpr bool kCopies = kSignedFours;
+  template <typename S, typename W>
+  static S add(S sums, W x, W weights) {
+    return add_fours(sums, x, weights);
+  }
+  static void copy(const uint8_t* token, int64_t words, uint32_t* to) {
+    for (int64_t k = 0; k < words; ++k) to[k] = load_bits<uint32_t>(token + 4 * k) ^ 0x80808080;
+  }
+};
+
+// Two numbers of 16 bits in a word.
+struct Pairs : Bytes {
+  static constexpr int64_t kSplit = 2;
+  static constexpr bool kCopies = true;
+  template <typename S, typename W>
+  static S add(S sums, W x, W weights) {
+    return add_pairs(sums, x, weights);
+  }
+  static void copy(const uint8_t* token, int64_t words, uint32_t* to) {
+    split<uint16_t>(token, words, to);
+  }
+  // Writes the first and the third byte of each word, and behind these words all the others. The
+  // sign of Half is that of the bytes.
+  template <typename Half>
+  static void split(const void* from, int64_t words, uint32_t* to) {
+    const auto* bytes = static_cast<const uint8_t*>(from);
+    const auto some = [&]<int kWords>(int64_t k) {
+      const auto both = load_bits<Vector<Half, 2 * kWords>>(bytes + 4 * k);
+      store_bits(to + k, (both << 8) >> 8);
+      store_bits(to + words + k, both >> 8);
+    };
+    int64_t k = 0;
+    for (; k + kL <= words; k += kL) some.template operator()<kL>(k);
+    for (; k + 4 <= words; k += 4) some.template operator()<4>(k);
+    for (; k < words; ++k) some.template operator()<1>(k);
+  }
+};
 
 inline float word(const float* token, int64_t k) { return token[k]; }
-inline uint32_t word(const uint8_t* token, int64_t k) { return load_bits<uint32_t>(token + 4 * k); }
-
-inline Floats add_product(Floats sums, Floats x, Floats weights) { return sums + x * weights; }
-
-// Computes x Phi(x), where Phi is the normal distribution. 1 - Phi(|x|) equals e^(-x^2 / 2) times a
-// polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
-inline Floats gelu(Floats x) {
-  const Floats size = x < 0 ? -x : x;
-  const Floats t = 1 / (1 + 0.35f * size);
-  constexpr float terms[] = {-2.91455662e-2f, 1.43970054e-1f,  -2.55711114e-1f,
-                             1.59170855e-1f,  -2.31077446e-2f, 1.05507193e-1f,
-                             1.19833056e-1f,  1.39861846e-1f,  1.39621406e-1f};
-  Floats tail = splat<Floats>(terms[0]);
-#pragma GCC unroll 16
-  for (std::size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
-  tail = tail * t * exponential_of_negative(size * size * -0.5f);
-  return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
+[[maybe_unused]] inline uint32_t word(const uint8_t* token, int64_t k) {
+  return load_bits<uint32_t>(token + 4 * k);
 }
+inline uint32_t word(const uint32_t* token, int64_t k) { return token[k]; }
 
 // Calls body(i, v) for each register of a tile. The loops are unrolled, because a tile stays in
 // registers only then.
@@ -61,36 +103,50 @@ template <int kRows, int kWide, typename Body>
 }
 
 // One panel of columns, for one block of rows.
-template <typename X>
+template <typename P>
 struct Panel {
+  using X = typename P::X;
+  using Word = typename P::Word;
+  using Weights = Vector<Word, kL>;
+  using Sums = Vector<typename P::Sum, kL>;
+  using Token = std::conditional_t<P::kCopies, Word, X>;  // what a tile reads
+
   const LinearArgs<X>& a;
   int64_t padded, words;  // columns of the layer, and words of the depth
   int64_t first, width;   // of its columns
-  const Word<X>* weight;  // (words, width)
-  Sums<X>* sums;          // (rows of the block, kPanel): the sums over the earlier parts
+  const Word* weight;     // (words, width)
+  Sums* sums;             // (rows of the block, kPanel): the sums over the earlier parts
 
-  // Computes kRows rows and kWide registers of columns, for the words [begin, end).
+  // A part of the depth.
+  struct Part {
+    int64_t begin, end, words;  // of the layer, and words in a tile
+    const Word* weight;         // (words in a tile, width)
+    Sums* start;                // (kPanel,): where the sums start, if not at zero
+  };
+
+  // Computes kRows rows and kWide registers of columns. The rows of x are `stride` apart.
   template <int kRows, int kWide>
-  [[gnu::noinline]] void tile(int64_t row, int64_t n, int64_t begin, int64_t end,
-                              Sums<X>* so_far) const {
-    using Weights = Vector<Word<X>, kL>;
-    const X* x = a.x + row * a.depth;
-    const Word<X>* w = weight + n;
-    Sums<X> sum[kRows][kWide] = {};
-    for (int64_t k = begin; k < end; ++k) {
+  [[gnu::noinline]] void tile(const Token* x, int64_t stride, const Part& part, int64_t row,
+                              int64_t n, Sums* so_far) const {
+    const Word* w = part.weight + n;
+    Sums sum[kRows][kWide] = {};
+    if constexpr (is_same_v<P, Fours> && kSignedFours) {
+      each_register<kRows, kWide>([&](int i, int v) { sum[i][v] = part.start[n / kL + v]; });
+    }
+    for (int64_t k = 0; k < part.words; ++k) {
       Weights weights[kWide];
       for (int v = 0; v < kWide; ++v) weights[v] = load<Weights>(w + k * width + v * kL);
       each_register<kRows, kWide>([&](int i, int v) {
-        sum[i][v] = add_product(sum[i][v], splat<Weights>(word(x + i * a.depth, k)), weights[v]);
+        sum[i][v] = P::add(sum[i][v], splat<Weights>(word(x + i * stride, k)), weights[v]);
       });
     }
-    const auto earlier = [&](int i, int v) -> Sums<X>& {
+    const auto earlier = [&](int i, int v) -> Sums& {
       return so_far[i * kPanel / kL + n / kL + v];
     };
-    if (begin > 0) {
+    if (part.begin > 0) {
       each_register<kRows, kWide>([&](int i, int v) { sum[i][v] += earlier(i, v); });
     }
-    if (end < words) {
+    if (part.end < words) {
       each_register<kRows, kWide>([&](int i, int v) { earlier(i, v) = sum[i][v]; });
       return;
     }
@@ -114,12 +170,12 @@ struct Panel {
   }
 
   // Returns the values of the sums of columns `column`, `column` + 1, ...
-  Floats value(Sums<X> sum, int64_t column) const {
+  Floats value(Sums sum, int64_t column) const {
     const auto* bias = static_cast<const float*>(a.packed) + column;
     if constexpr (is_same_v<X, float>) {
       return sum + load<Floats>(bias);
     } else {
-      sum += load_bits<Sums<X>>(bias + 2 * padded);
+      sum += load_bits<Sums>(bias + 2 * padded);
       // In the order of oneDNN's products, so that the bits are the same.
       const Floats scaled = __builtin_convertvector(sum, Floats) * a.scale;
       return unfused(scaled * load<Floats>(bias + padded)) + load<Floats>(bias);
@@ -132,72 +188,123 @@ struct Panel {
   [[gnu::noinline]] void finish(const Floats (&tile)[kRows][kWide], int64_t place,
                                 int64_t left) const {
     const Quantize quantize(a.quantizer);
+    const After after = a.after;
+    const int64_t columns = a.columns;
+    float* const out = a.out;
+    uint8_t* const quantized = a.quantized;
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
-        const int64_t to = place + i * a.columns + v * kL, count = smaller(kL, left - v * kL);
-        const Floats result = a.after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
-        float lanes[kL];
-        store(lanes, result);
-        if (a.quantized != nullptr) {
-          quantize(a.quantized + to, lanes, count);
-        } else if (a.after != After::add && count == kL) {
-          store(a.out + to, result);
-        } else {
+        const int64_t to = place + i * columns + v * kL, count = smaller(kL, left - v * kL);
+        const Floats result = after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
+        if (count < kL || after == After::add) {
+          float lanes[kL];
+          store(lanes, result);
           for (int64_t lane = 0; lane < count; ++lane) {
-            float& number = a.out[to + lane];
-            number = a.after == After::add ? number + lanes[lane] : lanes[lane];
+            if (quantized != nullptr) {
+              quantize(quantized + to + lane, lanes[lane]);
+            } else {
+              out[to + lane] = after == After::add ? out[to + lane] + lanes[lane] : lanes[lane];
+            }
           }
+        } else if (quantized != nullptr) {
+          quantize(quantized + to, result);
+        } else {
+          store(out + to, result);
         }
       }
     }
   }
 
   template <int kRows>
-  void columns(int64_t row, int64_t begin, int64_t end, Sums<X>* so_far) const {
+  void columns(const Part& part, int64_t row, Sums* so_far) const {
+    const X* token = a.x + row * a.depth + part.begin * kDepths<X>;
+    if constexpr (P::kCopies) {
+      Word copy[kRows * kPart];
+      for (int i = 0; i < kRows; ++i) {
+        P::copy(token + i * a.depth, part.end - part.begin, copy + i * kPart);
+      }
+      tiles<kRows>(copy, kPart, part, row, so_far);
+    } else {
+      tiles<kRows>(token, a.depth, part, row, so_far);
+    }
+  }
+  template <int kRows>
+  void tiles(const Token* x, int64_t stride, const Part& part, int64_t row, Sums* so_far) const {
     int64_t n = 0;
-    for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(row, n, begin, end, so_far);
-    for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(row, n, begin, end, so_far);
-    for (; n < width; n += kL) tile<kRows, 1>(row, n, begin, end, so_far);
+    for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(x, stride, part, row, n, so_far);
+    for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(x, stride, part, row, n, so_far);
+    for (; n < width; n += kL) tile<kRows, 1>(x, stride, part, row, n, so_far);
   }
 
   void rows(int64_t first_row, int64_t last_row) const {
-    for (int64_t begin = 0; begin < words; begin += kPart) {
-      const int64_t end = smaller(begin + kPart, words);
+    constexpr int64_t kStep = kPart / P::kSplit;
+    [[maybe_unused]] alignas(64) Word split[P::kSplit > 1 ? kPart * kPanel : 1];
+    [[maybe_unused]] Sums start[kPanel / kL];
+    for (int64_t begin = 0; begin < words; begin += kStep) {
+      const int64_t end = smaller(begin + kStep, words), count = end - begin;
+      Part part{begin, end, count * P::kSplit, weight + begin * width, start};
+      if constexpr (P::kSplit > 1) {
+        P::template split<int16_t>(part.weight, count * width, split);
+        // The next part, or that of the next panel, follows in memory.
+        const Word* next = part.weight + count * width;
+        for (int64_t k = 0; k < count * width; k += 64 / sizeof(Word)) fetch(next + k);
+        part.weight = split;
+      }
+      if constexpr (is_same_v<P, Fours> && kSignedFours) add_128(part);
       const auto so_far = [&](int64_t row) { return sums + (row - first_row) * kPanel / kL; };
       int64_t row = first_row;
       for (; row + kTileRows <= last_row; row += kTileRows) {
-        columns<kTileRows>(row, begin, end, so_far(row));
+        columns<kTileRows>(part, row, so_far(row));
       }
-      for (; row < last_row; ++row) columns<1>(row, begin, end, so_far(row));
+      for (; row < last_row; ++row) columns<1>(part, row, so_far(row));
+    }
+  }
+
+  // Makes the sums start at 128 times the sums of the weights.
+  void add_128(const Part& part) const {
+    for (int64_t n = 0; n < width; n += kL) {
+      Sums sum{};
+      for (int64_t k = 0; k < part.words; ++k) {
+        sum = P::add(sum, splat<Weights>(0x80808080), load<Weights>(part.weight + k * width + n));
+      }
+      part.start[n / kL] = -sum;  // each byte is -128
     }
   }
 };
 
-template <typename X>
-void linear_rows(const LinearArgs<X>& a, int64_t begin, int64_t end, int64_t first, int64_t last) {
-  Sums<X> sums[kMostRows * kPanel / kL];
+template <typename P>
+void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end, int64_t first,
+                 int64_t last) {
+  using X = typename P::X;
+  using Word = typename P::Word;
+  typename Panel<P>::Sums sums[kMostRows * kPanel / kL];
   // The block is small enough for its tokens to stay in the second-level cache.
   const int64_t fitting = kBlockBytes / (a.depth * static_cast<int64_t>(sizeof(X)));
   const int64_t most = smaller(kMostRows, round_up(1 + fitting, kTileRows));
   const int64_t padded = padded_columns(a.columns), words = depth_words<X>(a.depth);
-  const auto* weight = static_cast<const Word<X>*>(a.packed) + kParameters<X> * padded;
+  const auto* weight = static_cast<const Word*>(a.packed) + kParameters<X> * padded;
   for (int64_t row = begin; row < end; row += most) {
     for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded);
          column += kPanel) {
       const int64_t width = smaller(kPanel, padded - column);
-      const Panel<X> panel{a, padded, words, column, width, weight + column * words, sums};
+      const Panel<P> panel{a, padded, words, column, width, weight + column * words, sums};
       panel.rows(row, smaller(row + most, end));
     }
   }
 }
 
+template <typename P>
+constexpr auto if_there() -> decltype(&linear_rows<P>) {
+  if constexpr (kHasFours) {
+    return linear_rows<P>;
+  } else {
+    return nullptr;
+  }
+}
+
 }  // namespace
 
-TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<float>};
-#if defined(__AVX512F__)
-TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<uint8_t>};
-#else
-TIER_TABLE(LinearKernels<uint8_t>) = {.rows = nullptr};
-#endif
+TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<Numbers>, .by_fours = nullptr};
+TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<Pairs>, .by_fours = if_there<Fours>()};
 
 }  // namespace darswin

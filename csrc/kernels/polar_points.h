@@ -185,13 +185,17 @@ template <typename T>
 double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   if (a.offsets == nullptr) return 0;
   const T* row = a.offsets + b * a.offsets_stride + (a.num_radii + i) * a.num_azimuths;
-  T most = 0;
-#pragma omp simd reduction(max : most)
-  for (int64_t j = 0; j < a.num_azimuths; ++j) {
-    const T y = row[j] < 0 ? -row[j] : row[j];
-    most = larger(y, most);
+  using V = Vector<T, kLanes<T>>;
+  V most{};
+  int64_t j = 0;
+  for (; j + kLanes<T> <= a.num_azimuths; j += kLanes<T>) {
+    const V y = load<V>(row + j);
+    most = larger(y < 0 ? -y : y, most);
   }
-  return most;
+  T largest = 0;
+  for (int lane = 0; lane < kLanes<T>; ++lane) largest = larger(most[lane], largest);
+  for (; j < a.num_azimuths; ++j) largest = larger(row[j] < 0 ? -row[j] : row[j], largest);
+  return largest;
 }
 
 // Does the work of locate_through() with jitter. `tiny` means that turns are so small that short

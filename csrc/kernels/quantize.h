@@ -23,13 +23,13 @@ class Quantize {
   void operator()(uint8_t* to, V x) const {
     constexpr float kShift = 12582912.0f;  // its own lowest 22 bits are 0
     V value = x == x ? x * steps : V{};
-    value = value > lowest ? value : V{} + lowest;
-    value = value < highest ? value : V{} + highest;
+    value = value > lowest ? value : splat<V>(lowest);
+    value = value < highest ? value : splat<V>(highest);
     const auto bits = __builtin_bit_cast(BitsOf<V>, value + kShift) + zero_point;
     if constexpr (is_same_v<V, float>) {
       *to = static_cast<uint8_t>(bits);
     } else {
-      store_bits(to, __builtin_convertvector(bits, Vector<uint8_t, kLanes<float>>));
+      store_lowest_bytes(to, bits);
     }
   }
   void operator()(uint8_t* to, const float* from, int64_t count) const {

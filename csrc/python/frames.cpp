@@ -1,19 +1,21 @@
 // The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use
-// torch, and OpenMP neither, whose library a system without torch may lack.
-#include "../frames.h"
-
+// torch.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <cerrno>
 #include <memory>
 #include <optional>
+#include <span>
 #include <string>
-#include <thread>
+#include <system_error>
 #include <vector>
 
 #include "../core/dispatch.h"
+#include "../core/network_file.h"
+#include "../core/parallel.h"
 
 // glibc 2.34 gave the same function a new version (see portable.cpp).
 #if defined(__GLIBC__) && defined(__x86_64__)
@@ -27,15 +29,13 @@ namespace py = pybind11;
 namespace darswin {
 namespace {
 
-constexpr int64_t kMostReads = 16;  // along a side of a pixel: all points fit one block
-
 template <typename T>
 using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
-using Shape = std::vector<py::ssize_t>;
+using Shape = std::vector<int64_t>;
 
 std::string shown(const Shape& shape) {
   std::string text = "(";
-  for (const py::ssize_t size : shape) text += std::to_string(size) + ", ";
+  for (const int64_t size : shape) text += std::to_string(size) + ", ";
   return text.substr(0, std::max<size_t>(text.size(), 3) - 2) + ")";
 }
 
@@ -53,178 +53,136 @@ bool share_memory(const py::array& one, const py::array& other) {
 }
 
 template <typename T>
-std::vector<T> padded(const Array<T>& array) {
-  std::vector<T> values(array.data(), array.data() + array.size());
-  values.resize(values.size() + kFrameSpare);
-  return values;
+std::span<const T> span_of(const Array<T>& array) {
+  return {array.data(), static_cast<size_t>(array.size())};
 }
 
-// Samples frames of one size at the places of one plan. A call changes nothing in the object, so
-// several threads may call it at once.
-class Sampler {
- public:
-  Sampler(const Array<int16_t>& columns, const Array<int16_t>& rows, const Array<float>& right,
-          const Array<float>& lower, std::pair<int64_t, int64_t> size, std::vector<float> scale,
-          std::vector<float> offset, const std::string& output, int64_t reads)
-      : reads(reads * reads),
-        shape(columns.shape(), columns.shape() + columns.ndim() - (reads > 1)),
-        columns(padded(columns)),
-        rows(padded(rows)),
-        right(padded(right)),
-        lower(padded(lower)),
-        height(size.first),
-        width(size.second),
-        scale(std::move(scale)),
-        offset(std::move(offset)) {
-    const int64_t points = columns.size();
-    const bool tokens = output == "tokens",
-               known = tokens || output == "image" || output == "uint8";
-    const bool sizes = height > 0 && width > 0 && height <= INT16_MAX && width <= INT16_MAX;
-    const bool channels = this->scale.size() == 1 || this->scale.size() == 3;
-    const bool axes =
-        tokens ? shape.size() == 4 && reads == 1 : shape.size() == 2 || shape.size() == 3;
-    if (!known || !sizes || !channels || this->scale.size() != this->offset.size() || reads < 1 ||
-        reads > kMostReads || !axes || (reads > 1 && columns.shape(shape.size()) != this->reads) ||
-        rows.size() != points || right.size() != points || lower.size() != points) {
-      throw py::value_error("the parts of the plan do not fit together");
-    }
-    kind = tokens              ? FrameOutput::tokens
-           : output == "image" ? FrameOutput::planes
-                               : FrameOutput::bytes;
-    for (int64_t k = 0; k < points; ++k) {
-      const float x = this->right[k], y = this->lower[k];
-      if (!(x >= 0 && x <= 1 && y >= 0 && y <= 1)) {
-        throw py::value_error("the plan has distances outside of [0, 1]");
+// Checks for an array (H, W), (H, W, 1) or (H, W, 3) of uint8.
+Frame frame_of(const py::object& given) {
+  if (!py::isinstance<py::array_t<uint8_t>>(given)) {
+    throw py::type_error("frame must be a NumPy array of uint8, got " +
+                         std::string(py::isinstance<py::array>(given)
+                                         ? py::str(given.attr("dtype"))
+                                         : py::str(py::type::of(given))));
+  }
+  const auto frame = py::reinterpret_borrow<py::array>(given);
+  const Shape sizes(frame.shape(), frame.shape() + frame.ndim());
+  const bool colors = sizes.size() == 3;
+  const int64_t channels = colors ? sizes[2] : 1;
+  if ((sizes.size() != 2 && !colors) || (channels != 1 && channels != 3)) {
+    throw py::value_error("frame must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
+                          shown(sizes));
+  }
+  return {.pixels = static_cast<const uint8_t*>(frame.data()),
+          .height = sizes[0],
+          .width = sizes[1],
+          .channels = channels,
+          .row_stride = frame.strides(0),
+          .column_stride = frame.strides(1),
+          .channel_stride = colors ? frame.strides(2) : 0};
+}
+
+void check_threads(int64_t threads) {
+  if (threads < 1) throw py::value_error("threads must be at least 1");
+}
+
+// The array for a result of this type and these sizes: a new one, or the given one if it fits and
+// shares no memory with the frame.
+template <typename T>
+py::array output_array(const py::object& given, const Shape& sizes, const py::object& frame) {
+  if (given.is_none()) return py::array(py::dtype::of<T>(), sizes);
+  if (!py::isinstance<py::array>(given)) {
+    throw py::type_error("out must be a NumPy array, got " +
+                         std::string(py::str(py::type::of(given))));
+  }
+  const auto out = py::reinterpret_borrow<py::array>(given);
+  if (!py::isinstance<py::array_t<T>>(out) || !(out.flags() & py::array::c_style) ||
+      !out.writeable() || Shape(out.shape(), out.shape() + out.ndim()) != sizes) {
+    throw py::value_error("out must be a writeable, C-contiguous array of " +
+                          std::string(py::str(py::dtype::of<T>())) + " with shape " + shown(sizes));
+  }
+  if (share_memory(py::reinterpret_borrow<py::array>(frame), out)) {
+    throw py::value_error("out must not share memory with the frame");
+  }
+  return out;
+}
+
+py::array sample(const FrameSampler& sampler, const py::object& given, const py::object& out,
+                 int64_t threads) {
+  const Frame frame = frame_of(given);
+  check_threads(threads);
+  sampler.check(frame);
+  const bool colors = py::reinterpret_borrow<py::array>(given).ndim() == 3;
+  const Shape sizes = sampler.output_shape(frame.channels, colors);
+  py::array result = sampler.makes_bytes() ? output_array<uint8_t>(out, sizes, given)
+                                           : output_array<float>(out, sizes, given);
+  void* const to = result.mutable_data();
+  const py::gil_scoped_release free;
+  const ThreadLimit limit(threads);
+  sampler.sample(frame, to);
+  return result;
+}
+
+py::object run_network(const FrameNetwork& network, const py::object& given, const py::object& out,
+                       int64_t threads) {
+  const Frame frame = frame_of(given);
+  check_threads(threads);
+  network.check(frame);
+  const bool is_list = network.finish() == FrameNetwork::Finish::list;
+  const int64_t count = network.output_count();
+  py::list results;
+  std::vector<float*> to;
+  if (is_list && !out.is_none() &&
+      (!py::isinstance<py::list>(out) || static_cast<int64_t>(py::len(out)) != count)) {
+    throw py::type_error("out must be a list of " + std::to_string(count) + " arrays, got " +
+                         std::string(py::str(py::type::of(out))));
+  }
+  for (int64_t k = 0; k < count; ++k) {
+    const py::object one = is_list && !out.is_none() ? py::object(out[py::int_(k)]) : out;
+    py::array result = output_array<float>(one, network.output_shape(k), given);
+    for (const py::handle other : results) {
+      if (share_memory(py::reinterpret_borrow<py::array>(other), result)) {
+        throw py::value_error("the arrays of out must not share memory");
       }
     }
-    for (int64_t first = 0; first < points; first += this->reads) {
-      bool inside = true;
-      for (int64_t k = first; k < first + this->reads; ++k) {
-        inside &= this->columns[k] >= 0 && this->rows[k] >= 0 && this->columns[k] < width - 1 &&
-                  this->rows[k] < height - 1;
-      }
-      for (int64_t k = first; k < first + this->reads && !inside; ++k) {
-        int16_t &column = this->columns[k], &row = this->rows[k];
-        border.push_back({k, column, row, this->right[k], this->lower[k]});
-        column = row = 0;
-      }
-    }
+    to.push_back(static_cast<float*>(result.mutable_data()));
+    results.append(std::move(result));
   }
-
-  py::array operator()(const py::object& given, const py::object& out, int64_t threads) const {
-    if (!py::isinstance<py::array_t<uint8_t>>(given)) {
-      throw py::type_error("frame must be a NumPy array of uint8, got " +
-                           std::string(py::isinstance<py::array>(given)
-                                           ? py::str(given.attr("dtype"))
-                                           : py::str(py::type::of(given))));
-    }
-    const auto frame = py::reinterpret_borrow<py::array>(given);
-    if (threads < 1) throw py::value_error("threads must be at least 1");
-    const Shape sizes(frame.shape(), frame.shape() + frame.ndim());
-    const bool colors = sizes.size() == 3;
-    FrameArgs a{};
-    ByteImage& image = a.image;
-    image.channels = colors ? sizes[2] : 1;
-    if ((sizes.size() != 2 && !colors) || (image.channels != 1 && image.channels != 3)) {
-      throw py::value_error("frame must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
-                            shown(sizes));
-    }
-    if (sizes[0] != height || sizes[1] != width) {
-      throw py::value_error("frame must be of the plan's size, (H, W) = " + shown({height, width}) +
-                            ", got " + shown({sizes[0], sizes[1]}));
-    }
-    if (scale.size() > 1 && image.channels != static_cast<int64_t>(scale.size())) {
-      throw py::value_error("frame must have the plan's " + std::to_string(scale.size()) +
-                            " channels, got " + std::to_string(image.channels));
-    }
-    image.pixels = static_cast<const uint8_t*>(frame.data());
-    image.height = height, image.width = width;
-    // The stride of an axis of size 1 may be any number, and is never used.
-    const auto stride = [&](int axis) { return sizes[axis] > 1 ? frame.strides(axis) : 0; };
-    image.row_stride = stride(0), image.column_stride = stride(1),
-    image.channel_stride = colors ? stride(2) : 0;
-    if ((height - 1) * std::abs(static_cast<double>(image.row_stride)) +
-            (width - 1) * std::abs(static_cast<double>(image.column_stride)) >=
-        INT32_MAX) {
-      throw py::value_error("frame must span less than 2 GB of memory");
-    }
-    float factors[3] = {1, 1, 1}, shifts[3] = {};  // bytes are not normalized
-    for (int c = 0; c < 3 && kind != FrameOutput::bytes; ++c) {
-      factors[c] = scale[scale.size() > 1 ? c : 0], shifts[c] = offset[scale.size() > 1 ? c : 0];
-    }
-    image.scale = factors, image.offset = shifts;
-    a.columns = columns.data(), a.rows = rows.data();
-    a.right = right.data(), a.lower = lower.data();
-    a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
-    const int64_t pictures = kind != FrameOutput::tokens && shape.size() == 3 ? shape[0] : 1;
-    a.reads = reads, a.pixels = a.points / reads / std::max<int64_t>(pictures, 1);
-    a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
-    a.output = kind;
-    py::array result = output_array(out, output_shape(image.channels, colors));
-    if (!out.is_none() && share_memory(frame, result)) {
-      throw py::value_error("out must not share memory with the frame");
-    }
-    a.out = result.mutable_data();
-    {
-      const py::gil_scoped_release free;
-      run(a, threads);
-    }
-    return result;
+  {
+    const py::gil_scoped_release free;
+    const ThreadLimit limit(threads);
+    network.run(frame, to.data());
   }
+  if (!is_list) return results[0];
+  return out.is_none() ? results : out;
+}
 
- private:
-  Shape output_shape(int64_t channels, bool colors) const {
-    if (kind == FrameOutput::tokens) {
-      return {shape[0], shape[1], shape[2] * shape[3] * channels};
-    }
-    Shape sizes = shape;
-    if (kind == FrameOutput::planes) sizes.insert(sizes.end() - 2, channels);
-    if (kind == FrameOutput::bytes && colors) sizes.push_back(channels);
-    return sizes;
+// Returns a function that runs the network of a file, and what the file says of it: the size of the
+// frames, the shapes of the outputs, and the labels.
+py::tuple open_network(const std::string& path) {
+  std::shared_ptr<const FrameNetwork> network;
+  try {
+    const py::gil_scoped_release free;
+    network = std::make_shared<const FrameNetwork>(path);
+  } catch (const std::system_error& error) {
+    errno = error.code().value();
+    PyErr_SetFromErrnoWithFilename(PyExc_OSError, path.c_str());
+    throw py::error_already_set();
   }
-
-  py::array output_array(const py::object& given, const Shape& sizes) const {
-    const bool bytes = kind == FrameOutput::bytes;
-    const py::dtype type = bytes ? py::dtype::of<uint8_t>() : py::dtype::of<float>();
-    if (given.is_none()) return py::array(type, sizes);
-    if (!py::isinstance<py::array>(given)) {
-      throw py::type_error("out must be a NumPy array, got " +
-                           std::string(py::str(py::type::of(given))));
-    }
-    const auto out = py::reinterpret_borrow<py::array>(given);
-    const bool same =
-        bytes ? py::isinstance<py::array_t<uint8_t>>(out) : py::isinstance<py::array_t<float>>(out);
-    if (!same || !(out.flags() & py::array::c_style) || !out.writeable() ||
-        Shape(out.shape(), out.shape() + out.ndim()) != sizes) {
-      throw py::value_error("out must be a writeable, C-contiguous array of " +
-                            std::string(bytes ? "uint8" : "float32") + " with shape " +
-                            shown(sizes));
-    }
-    return out;
+  const py::cpp_function run(
+      [network](const py::object& frame, const py::object& out, int64_t threads) {
+        return run_network(*network, frame, out, threads);
+      },
+      py::name("run"), py::arg("frame"), py::arg("out") = py::none(), py::arg("threads") = 1);
+  py::list shapes, labels;
+  for (int64_t k = 0; k < network->output_count(); ++k) {
+    shapes.append(py::tuple(py::cast(network->output_shape(k))));
   }
-
-  static void run(const FrameArgs& a, int64_t threads) {
-    // A new thread takes about 20 µs to start, as long as 10,000 points take.
-    constexpr int64_t kLeast = 10'000;
-    const auto& kernel = kernels<FrameKernels>();
-    threads = std::clamp<int64_t>(a.points / kLeast, 1, threads);
-    const auto end = [&](int64_t t) { return a.points / a.reads * t / threads * a.reads; };
-    std::vector<std::jthread> others;
-    for (int64_t t = 1; t < threads; ++t) {
-      others.emplace_back(kernel.sample, std::cref(a), end(t), end(t + 1));
-    }
-    kernel.sample(a, 0, end(1));
-  }
-
-  const int64_t reads;
-  const Shape shape;
-  std::vector<int16_t> columns, rows;
-  const std::vector<float> right, lower;
-  const int64_t height, width;
-  const std::vector<float> scale, offset;
-  FrameOutput kind;
-  std::vector<BorderPoint> border;
-};
+  for (const std::string& label : network->labels()) labels.append(py::str(label));
+  return py::make_tuple(run,
+                        py::make_tuple(network->height(), network->width(), network->channels()),
+                        shapes, labels);
+}
 
 // Finds the places of the points of one polar grid among the pixels of images of one size.
 py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
@@ -263,12 +221,24 @@ PYBIND11_MODULE(_frames, m) {
                       const Array<float>& right, const Array<float>& lower,
                       std::pair<int64_t, int64_t> size, std::vector<float> scale,
                       std::vector<float> offset, const std::string& output, int64_t reads) {
-    const auto sampler = std::make_shared<const Sampler>(
-        columns, rows, right, lower, size, std::move(scale), std::move(offset), output, reads);
-    return py::cpp_function([sampler](const py::object& frame, const py::object& out,
-                                      int64_t threads) { return (*sampler)(frame, out, threads); },
-                            py::name("sample"), py::arg("frame"), py::arg("out") = py::none(),
-                            py::arg("threads") = 1);
+    const auto sampler = std::make_shared<const FrameSampler>(
+        FramePlan{.shape = Shape(columns.shape(), columns.shape() + columns.ndim()),
+                  .columns = span_of(columns),
+                  .rows = span_of(rows),
+                  .right = span_of(right),
+                  .lower = span_of(lower),
+                  .height = size.first,
+                  .width = size.second,
+                  .scale = std::move(scale),
+                  .offset = std::move(offset),
+                  .output = output,
+                  .reads = reads});
+    return py::cpp_function(
+        [sampler](const py::object& frame, const py::object& out, int64_t threads) {
+          return sample(*sampler, frame, out, threads);
+        },
+        py::name("sample"), py::arg("frame"), py::arg("out") = py::none(), py::arg("threads") = 1);
   });
+  m.def("network", &open_network);
   m.def("polar_places", &polar_places);
 }

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from darswin.bench import timing
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import OneDNN, Own, has_own_int8, library, onednn_linear
+from darswin.deploy.packed import OneDNN, Own, library, onednn_linear
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import Linear, best_seconds, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
@@ -131,9 +131,9 @@ def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], T
     """One linear layer by each library that computes it, in `dtype` or as it is quantized."""
     libraries: dict[str, Callable[[Tensor], Tensor]]
     if isinstance(layer, QuantizedLinear):
-        libraries = {"onednn": OneDNN(dtype).linear(layer)}
-        if has_own_int8():
-            libraries["darswin"] = Own().linear(layer)
+        libraries = {"darswin": Own().linear(layer)}
+        if onednn_lack(torch.int8) is None:
+            libraries["onednn"] = OneDNN(dtype).linear(layer)
         return libraries
     weight = layer.weight.detach().to(dtype)
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)

@@ -5,7 +5,7 @@ import platform
 import subprocess
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,18 +14,22 @@ import torch
 from darswin.ops import _module, cpu_capability
 
 T = TypeVar("T")
+# The packages whose speed is measured or compared with; OpenCV has two.
+PACKAGES = (
+    "torch", "numpy", "onnxruntime", "openvino", "opencv-python", "opencv-python-headless",
+)  # fmt: skip
 THREADS = sorted({1, torch.get_num_threads()})  # the numbers of threads to measure with
 
 
 def machine() -> dict[str, str | int]:
-    """The head of a record: CPU, tier, versions and, in a checkout, the commit."""
+    """The head of a record: CPU, tier, the versions of all peers and, in a checkout, the commit."""
     return dict(
         cpu=_cpu(),
         cores=max(THREADS),
         tier=cpu_capability(),
         compiler=_module.build_info()["compiler"],
         python=platform.python_version(),
-        torch=torch.__version__,
+        **_versions(),
         darswin=version("darswin"),
         commit=_commit(),
     )
@@ -68,6 +72,14 @@ def _cpu() -> str:
     if "cpu family" not in facts:
         return name
     return f"{name} (family {facts['cpu family']}, model {facts['model']})"
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def _commit() -> str:

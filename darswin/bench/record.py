@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from darswin.bench.memory import Memory
+from darswin.bench.start import Start
 from darswin.bench.timing import Timing
 from darswin.utils.files import replace_file
 
@@ -20,6 +21,7 @@ class Record:
     machine: dict  # of `darswin.bench.machine`
     timings: list[Timing]
     memory: list[Memory] = field(default_factory=list)
+    starts: list[Start] = field(default_factory=list)  # of programs without torch
     operations: int = 0  # of floating point, in a model's matrix products for one image
     autotune: list[dict] = field(default_factory=list)  # rows of `autotune_results`
 
@@ -32,6 +34,7 @@ class Record:
         content = json.loads(path.read_text())
         content["timings"] = [Timing(**row) for row in content["timings"]]
         content["memory"] = [Memory(**row) for row in content.get("memory", ())]
+        content["starts"] = [Start(**row) for row in content.get("starts", ())]
         return cls(**content)
 
     def publish(self, folder: Path, suite: str, draw: Callable[["Record", Path], None]) -> None:

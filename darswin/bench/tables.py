@@ -1,9 +1,11 @@
 """Measurements as tables in Markdown; "a / b" means at one and at all threads."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from darswin.bench.memory import Memory, compared
 from darswin.bench.record import Record
+from darswin.bench.start import Start
 from darswin.bench.timing import (
     COMPILED,
     COMPILED_BFLOAT16,
@@ -14,6 +16,7 @@ from darswin.bench.timing import (
     OURS_FLOAT32,
     REFERENCE,
     Timing,
+    threads_label,
 )
 
 BOTH = "\u00a0/\u00a0"  # at one and at all threads, on one line
@@ -25,10 +28,21 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
+def pivot(corner: str, cells: Iterable[tuple[str, str, str]]) -> str:
+    """A table of cells, each with the names of its row and its column; the others are empty."""
+    rows: dict[str, dict[str, str]] = {}
+    columns: dict[str, None] = {}
+    for row, column, cell in cells:
+        rows.setdefault(row, {})[column] = cell
+        columns[column] = None
+    lines = ([name, *(row.get(column, "") for column in columns)] for name, row in rows.items())
+    return markdown([corner, *columns], lines)
+
+
 def by_case(timings: Iterable[Timing]) -> dict[tuple[str, int, str], dict[str, list[Timing]]]:
     """Groups timings by setting, batch and mode, then by name; fewest threads first."""
     found: dict[tuple[str, int, str], dict[str, list[Timing]]] = {}
-    for t in sorted(timings, key=lambda t: t.threads):
+    for t in sorted(timings, key=lambda t: t.threads or math.inf):  # `DEFAULT` last
         found.setdefault((t.setting, t.batch, t.mode), {}).setdefault(t.name, []).append(t)
     return found
 
@@ -74,6 +88,31 @@ def quantized_table(timings: Sequence[Timing]) -> str:
         if mode == "inference, int8"
     ]
     return markdown(["over 8 bits", *peers], rows)
+
+
+def paced_table(timings: Iterable[Timing]) -> str:
+    """Frames at the pace of a camera: a row for each case and number of threads, a column for each
+    candidate with p50, p99 and CPU time in ms."""
+    return pivot("p50 / p99 / CPU time, ms", (_paced_cell(t) for t in timings if t.paced))
+
+
+def _paced_cell(t: Timing) -> tuple[str, str, str]:
+    assert t.p99 is not None and t.cpu is not None
+    what = t.mode.partition(", ")[2]
+    row = f"`{t.subject}`, {t.setting}, {what}, {threads_label(t.threads)}"
+    times = (float(f"{1e3 * seconds:.3g}") for seconds in (t.median, t.p99, t.cpu))
+    return row, t.name, " / ".join(f"{time:g}" for time in times)
+
+
+def starts_table(starts: Iterable[Start]) -> str:
+    """Seconds and memory of first answers: a row for each model, a column for each runtime."""
+    return pivot(
+        "first answer",
+        (
+            (f"`{x.subject}`", x.name, f"{x.seconds:.2f} s, {x.resident / 2**20:.0f} MB")
+            for x in starts
+        ),
+    )
 
 
 def memory_table(memory: Sequence[Memory]) -> str:

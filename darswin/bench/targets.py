@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from darswin.bench.memory import Memory, compared
+from darswin.bench.start import Start
 from darswin.bench.timing import (
     COMPILED,
     COMPILED_BFLOAT16,
@@ -33,6 +34,10 @@ MODEL_TARGETS = {
     ("training, bfloat16", 8): {REFERENCE: 1.15},
 }
 MEMORY_TARGET = 0.8  # the largest ratio of the peak of a training step over the reference's
+# For frames at the pace of a camera: the least ratio of our median over our p99, and of our times
+# on one thread over those on more.
+STEADY, MORE_THREADS = 1 / 1.5, 1 / 1.05
+START_SECONDS, START_MEGABYTES = 0.3, 60  # the most for a program's first answer
 
 
 def of_model(case: Case) -> dict[str, float]:
@@ -49,10 +54,10 @@ def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
     for t in timings:
         if t.target is None:
             continue
-        line = _against(t.ratio, t.target, t.missed)
+        line = _at_least(t.ratio, t.target)
         if t.label in avx2:
             ratio, target = t.median / avx2[t.label].median, t.target * avx2_share
-            line += f"; avx2 {_against(ratio, target, ratio < target)}"
+            line += f"; avx2 {_at_least(ratio, target)}"
         found.append(f"{t.label}: {t.name} {line}")
     return found
 
@@ -60,11 +65,48 @@ def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
 def memory_lines(memory: Sequence[Memory]) -> list[str]:
     """Compares the peaks of training steps of `MODEL` with their target."""
     return [
-        f"peak memory, {what}: {_against(a / b, MEMORY_TARGET, a / b > MEMORY_TARGET)}"
+        f"peak memory, {what}: {_at_most(a / b, MEMORY_TARGET)}"
         for what, a, b in compared(memory)
         if what.startswith("training")
     ]
 
 
-def _against(ratio: float, target: float, missed: bool) -> str:
-    return f"{ratio:.2f} (target {target:.2f}){' MISSED' if missed else ''}"
+def paced_lines(timings: Sequence[Timing]) -> list[str]:
+    """Compares our times at the pace of a camera with each other: p99 with the median, and both on
+    one thread with those on more."""
+    ours = [t for t in timings if t.paced and t.name == OURS]
+    alone = {(t.subject, t.setting, t.batch, t.mode): t for t in ours if t.threads == 1}
+    found = []
+    for t in ours:
+        ratios = {"p50 over p99": (t.median / _p99(t), STEADY)}
+        if t.threads != 1:
+            one = alone[t.subject, t.setting, t.batch, t.mode]
+            ratios["p50 on one thread"] = (one.median / t.median, MORE_THREADS)
+            ratios["p99 on one thread"] = (_p99(one) / _p99(t), MORE_THREADS)
+        found += [f"{t.label}: {what} {_at_least(*ratio)}" for what, ratio in ratios.items()]
+    return found
+
+
+def _p99(t: Timing) -> float:
+    assert t.p99 is not None
+    return t.p99
+
+
+def start_lines(starts: Sequence[Start]) -> list[str]:
+    """Compares the seconds and the megabytes of our first answers with their targets."""
+    return [
+        f"first answer, {start.subject}: {start.name} {what} {_at_most(value, most)}"
+        for start in starts
+        if start.name.startswith(OURS)
+        for what, value, most in (
+            ("s", start.seconds, START_SECONDS), ("MB", start.resident / 2**20, START_MEGABYTES),
+        )
+    ]  # fmt: skip
+
+
+def _at_least(value: float, target: float) -> str:
+    return f"{value:.2f} (target {target:.2f}){' MISSED' * (value < target)}"
+
+
+def _at_most(value: float, target: float) -> str:
+    return f"{value:.2f} (target {target:.2f}){' MISSED' * (value > target)}"

@@ -24,6 +24,7 @@ from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.saving import ModelCard
+from darswin.ops import _module
 from darswin.utils.files import replace_file
 from darswin.utils.tasks import Fit
 from darswin.views import Prepared
@@ -289,7 +290,10 @@ def write_overlay(out: Path, name: str, picture: np.ndarray) -> str:
 
 
 def fast(model: Net, card: ModelCard) -> Net:
-    """The model optimized in float32; a quantized model in the fastest type."""
+    """The model optimized in float32; a quantized model in the fastest type. Without the compiled
+    module, the model itself."""
+    if _module.LACK is not None:
+        return model.eval()
     return optimize(model, "fastest" if card.quantized else torch.float32)
 
 

@@ -104,8 +104,7 @@ def _measure(
 
 
 def _dtypes(mode: str) -> list[str]:
-    quantized = mode == "inference" and linear.onednn_lack(torch.int8) is None
-    return [*DTYPES, *(INT8 if quantized else ())]
+    return [*DTYPES, *(INT8 if mode == "inference" else ())]
 
 
 def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:

@@ -63,6 +63,7 @@ from darswin.utils.malloc import keep_freed_memory
 from darswin.utils.parameters import check
 from darswin.utils.processes import end_with_failed_process
 from darswin.utils.tasks import Task
+from darswin.utils.text import read_text
 
 # What the libraries of several processes say if one of them has gone.
 _LOST = r"Connection (closed|reset) by|gloo|NCCL|TCPStore|Broken pipe"
@@ -226,7 +227,7 @@ class RunCLI(LightningCLI):
                 for name, value in settled.items():
                     group[name] = value
         if config.resume and last_of(self.folder).exists():
-            before = yaml.safe_load((self.folder / "config.yaml").read_text())
+            before = yaml.safe_load(read_text(self.folder / "config.yaml"))
             now = yaml.safe_load(self._recorded(config))
             for name, change in check_changes(before, now).items():
                 say(f"--{name} {change}")

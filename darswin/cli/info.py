@@ -5,11 +5,11 @@ import platform
 import torch
 
 from darswin.bench.machine import machine
-from darswin.deploy.packed import fastest_dtype
+from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.layers.linear import onednn_lack
 from darswin.models import list_models, list_pretrained, read_card
 from darswin.ops import _module
-from darswin.utils.extras import lack
+from darswin.utils import extras
 
 EXTRAS = ("demo", "onnx", "train")
 
@@ -37,22 +37,25 @@ def facts() -> dict[str, str]:
     """Versions, CPU, instruction-set tiers, threads, oneDNN, and which extras are installed."""
     here = machine()
     commit = f", commit {here['commit']}" if here["commit"] else ""
+    lack = _module.LACK
+    made = f"compiled by {here['compiler']}" if lack is None else "without its compiled module"
     lines = {
-        "darswin": f"{here['darswin']}{commit}, compiled by {here['compiler']}",
+        "darswin": f"{here['darswin']}{commit}, {made}",
         "torch": str(here["torch"]),
         "python": f"{here['python']}, {platform.platform()}",
         "CPU": f"{here['cpu']}, {torch.get_num_threads()} threads",
         "tier": f"{here['tier']}, of {', '.join(_module.tiers())}",
     }
-    for dtype in (torch.float32, torch.bfloat16, torch.int8):
+    if lack is not None:
+        lines["tier"] = f"the PyTorch reference: {lack}"
+    for dtype in (torch.float32, torch.bfloat16):
         reason = onednn_lack(dtype)
-        other = "none" if dtype == torch.int8 else "torch"
-        lines[_name(dtype)] = "oneDNN" if reason is None else f"{other}: {reason}"
-    fastest = _name(fastest_dtype())
-    quantized = onednn_lack(torch.int8) is None
-    lines["fastest"] = f"int8 for quantized models, else {fastest}" if quantized else fastest
+        lines[_name(dtype)] = "oneDNN" if reason is None else f"torch: {reason}"
+    if lack is None:
+        lines["int8"] = "darswin" if has_own_int8() else "oneDNN"
+        lines["fastest"] = f"int8 for quantized models, else {_name(fastest_dtype())}"
     for extra in EXTRAS:
-        lines[f"[{extra}]"] = lack(extra) or "installed"
+        lines[f"[{extra}]"] = extras.lack(extra) or "installed"
     return lines
 
 

@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout.flush()
     except BrokenPipeError:  # `darswin lens info … | head` stops reading early
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, ValueError, FloatingPointError, MemoryError) as error:
+    except (OSError, ValueError, ImportError, FloatingPointError, MemoryError) as error:
         message = with_flags(error, command.flag_of)
         # A worker process puts its traceback into the message; only the last line is the error.
         if "Traceback" in message:

@@ -13,7 +13,6 @@ import numpy as np
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
-from darswin.cli.network import NetworkAnswers
 from darswin.cli.options import check_folder
 from darswin.compat import load_official
 from darswin.data.folders import PICTURES, pictures_and_videos_below
@@ -132,6 +131,8 @@ def predict(
     if network is None:
         kind, make = _of_model(weights, top)
     else:
+        from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
+
         through = NetworkAnswers(network, **options)
         kind, make = through.network.kind, through.into
     if task not in (None, kind):

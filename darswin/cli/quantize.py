@@ -21,6 +21,7 @@ from darswin.train.data import RunData
 from darswin.train.tasks import TASKS
 from darswin.utils.parameters import check
 from darswin.utils.progress import Progress
+from darswin.utils.text import read_text
 
 BATCH = 16
 
@@ -31,9 +32,10 @@ def quantize(
 ) -> str:  # fmt: skip
     """Converts the best model of a run to 8 bits, which makes it faster on CPUs.
 
-    On CPUs with VNNI, the large matrix products run two to three times as fast as in float32. The
-    ranges of the activations are measured on training pictures, through the lenses of training. The
-    parts that change the result most stay in float32. The command prints how much the results
+    The large matrix products run two to three times as fast as in float32 on CPUs with VNNI, and
+    about 1.5 times as fast on others. The ranges of the activations are measured on training
+    pictures, through the lenses of training. The parts that change the result most stay in float32.
+    The command prints how much the results
     change on validation pictures. `darswin predict --model FILE` and
     `darswin.optimize(model, "fastest")` run the file.
 
@@ -73,7 +75,7 @@ def quantize(
 
 def _data_of(run: Path) -> RunData:
     """The data of a run, from its configuration."""
-    config = yaml.safe_load((run / "config.yaml").read_text())
+    config = yaml.safe_load(read_text(run / "config.yaml"))
     options = config["data"] | dict(batch_size=BATCH, workers=0)
     return TASKS[config.get("task", FIRST_TASK)].data(**options)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from darswin.deploy.packed import InDtype, Layer, Own, library, refuse_gradients
+from darswin.deploy.packed import InDtype, Layer, Own, OwnBlocks, library, refuse_gradients
 from darswin.layers.embed import PatchProjection, PolarPatchEmbed
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
@@ -106,7 +106,8 @@ class FastMerging(PatchMerging):
 
 @fast.register(Stage)
 class FastStage(nn.Module):
-    """A stage whose blocks a library computes, in parts if the batch is large."""
+    """A stage whose blocks a library computes, in parts if the batch is large. Our own operator
+    takes parts itself."""
 
     def __init__(self, stage: Stage, dtype: torch.dtype):
         super().__init__()
@@ -139,7 +140,7 @@ class FastStage(nn.Module):
 
     def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
         x = self.downsample(x)
-        if x.numel() <= self.most_numbers:
+        if isinstance(self.blocks, OwnBlocks) or x.numel() <= self.most_numbers:
             return self.blocks(x, tables)
         count = min(-(-x.numel() // self.most_numbers), len(x))
         x = x.contiguous()

@@ -1,7 +1,7 @@
 """Fast copies of models for inference on CPUs.
 
-In float32 all blocks of a stage are one C++ operator, and in int8 too, if the CPU has AVX-512 VNNI.
-Otherwise oneDNN computes the products, and each residual is added by the norm that follows it.
+In float32 all blocks of a stage are one C++ operator, and in int8 too, except on CPUs with AMX.
+There, and in bfloat16, oneDNN computes the products, and the norm that follows a residual adds it.
 """
 
 import copy
@@ -13,14 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
+from darswin.deploy.forward import Run, compiled
 from darswin.deploy.packed import fastest_dtype
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
-from darswin.layers.quantized import quantized_layers, without_quantized_layers
+from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
+from darswin.ops import _module
 from darswin.views import Prepared
 from darswin.views.base import Pair
 
@@ -48,7 +50,7 @@ def optimize(
             layers and the result are bfloat16; distances stay float32. With int8, the products of a
             quantized model (see `quantize_model`) are computed with 8 bits, and the rest with
             float32; for a picture with infinite or NaN pixels the result is finite but meaningless.
-            "fastest": int8 for a quantized model if this CPU supports it, otherwise float32 or
+            "fastest": int8 for a quantized model or with a calibration, otherwise float32 or
             bfloat16, whichever is faster here.
         lens: a single lens, if all images come from one camera. The copy is then called
             `optimized(images)`. It computes the grid and the position biases once for each image
@@ -63,19 +65,14 @@ def optimize(
         TypeError: another kind of model.
         ValueError: an unsupported dtype or device; a `lens` that is not a single lens; a
             calibration without int8 or for a quantized model; int8 with neither.
-        RuntimeError: int8 on a CPU without 8-bit products.
+        ImportError: darswin's compiled module cannot be loaded.
     """
     _check(model, dtype, lens)
+    _module.require("optimize")
     if dtype == "fastest":
         is_whole = calibration is None and not quantized_layers(model)
-        lacks_int8 = onednn_lack(torch.int8) is not None
-        dtype = fastest_dtype() if is_whole or lacks_int8 else torch.int8
-        if lacks_int8:
-            model, calibration = copy.deepcopy(model), None
-            without_quantized_layers(model)
+        dtype = fastest_dtype() if is_whole else torch.int8
     if dtype == torch.int8:
-        if (lack := onednn_lack(dtype)) is not None:
-            raise RuntimeError(f'{lack}: optimize(model, "fastest") chooses a type that works here')
         model, dtype = _quantized(model, calibration), torch.float32
     elif calibration is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or a calibration needs dtype=torch.int8, got {dtype}")
@@ -88,6 +85,8 @@ def optimize(
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
+            if dtype == torch.float32 and part is optimized:
+                vars(part).update(compiled=compiled(part))
     return optimized
 
 
@@ -124,6 +123,12 @@ class Optimized(Model[Any]):
     dtype = torch.float32  # of the original weights
     fixed_lens: Lens | None = None
     known: dict[Pair, Prepared]  # the result of `prepare` for the fixed lens and each size
+    compiled: Run | None = None  # `forward_network` as programs
+
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        if self.compiled is None:
+            return super().forward_network(x, prepared, images)
+        return self.compiled(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         if self.fixed_lens is None:

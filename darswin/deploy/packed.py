@@ -5,77 +5,67 @@ They are plain callables: a module would take a microsecond more for each call.
 
 import contextlib
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.deploy.own import (
+    OwnLinear,
+    OwnNorm,
+    PackedBlocks,
+    norm_parameters,
+    own_operator,
+    packed_weights,
+    taken_by,
+)
+from darswin.deploy.program import RUN, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
-from darswin.ops import cpu_capability
 
 __all__ = ["fastest_dtype"]
 
 Layer = Callable[[Tensor], Tensor]
-# The map of a stage, which may change in place, and the position biases of its blocks → the map.
+# The map of a stage, which may change, and the position biases of its blocks → the map.
 Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 _OPS = torch.ops.darswin
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
-def _operator(name: str) -> Callable[..., Any]:
-    # Not by way of autograd, which would look for gradients and count versions: there are none.
-    return partial(getattr(_OPS, name).default.redispatch, _CPU)
-
-
-_ADD_NORM = _operator("_add_norm_")
-_ADD_NORM_QUANTIZED = _operator("_add_norm_quantized_")
-_NORM = _operator("_norm")
-_PACK = _operator("_pack_linear")
-_LINEAR = _operator("_linear")
-_BLOCKS = _operator("_blocks_")
+_ADD_NORM = own_operator("_add_norm_")
+_ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
 
 
 def has_own_int8() -> bool:
-    """True if our own kernels compute 8-bit products here. On CPUs with AMX, oneDNN uses AMX."""
-    has_vnni = torch.cpu._is_vnni_supported() and not torch.cpu._is_amx_tile_supported()
-    return has_vnni and cpu_capability() == "avx512"
+    """True if our own kernels compute 8-bit products here: not where oneDNN uses AMX."""
+    return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
-def packed_weights(linear: Any) -> Tensor:
-    """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
-    weight = linear.weight.detach()
-    bias = None if linear.bias is None else linear.bias.detach().float()
-    if (taken := taken_by(linear)) is not None:
-        return _PACK(weight, bias, linear.weight_scale.float(), *taken)
-    return _PACK(weight.float(), bias)
+class OwnBlocks(PackedBlocks):
+    """The blocks of a stage by one operator."""
 
+    def __init__(self, blocks: Sequence[Any]):
+        super().__init__(blocks)
+        self.weights = Weights()  # or those of a whole model
 
-def norm_parameters(norm: nn.LayerNorm) -> Tensor:
-    """The weight and the bias of a norm, (2, D) float32."""
-    return torch.stack((norm.weight, norm.bias)).detach().float()
+    @cached_property
+    def words(self) -> list[int]:
+        """The program of these blocks alone: a map and the position biases → the map."""
+        program = Program(self.weights)
+        x = program.input(*self.map_shape)
+        tables = [program.input(*shape) for shape in self.table_shapes]
+        out = program.permuted(x, self.map_shape, (0, 1, 2), *self.map_shape)
+        program.blocks(out, self, tables)
+        program.output(out)
+        return program.words()
 
-
-def packed_blocks(blocks: Sequence[Any]) -> tuple[list[Tensor], list[int], int, int, float]:
-    """The blocks of a stage as arguments of `_blocks_`: all but the map and the position biases."""
-    parameters: list[Tensor] = []
-    windows: list[int] = []
-    for block in blocks:
-        attn, mlp = block.attn, block.mlp
-        parameters += [
-            norm_parameters(block.norm1),
-            packed_weights(attn.qkv),
-            packed_weights(attn.proj),
-            norm_parameters(block.norm2),
-            packed_weights(mlp.fc1),
-            packed_weights(mlp.fc2),
-        ]
-        windows += [*attn.window, *attn.shift, *attn.periodic]
-    return parameters, windows, attn.num_heads, mlp.fc1.out_features, block.norm1.eps
+    def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        words = self.words
+        return RUN([x, *tables], self.weights.words, words)[0]
 
 
 class Own:
@@ -83,28 +73,18 @@ class Own:
 
     def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
         """A linear layer, behind a norm or before a GELU if asked."""
-        given: tuple = (packed_weights(layer), layer.out_features, gelu)
-        if norm is not None:
-            given = (*given, norm_parameters(norm), norm.eps)
-        return lambda x: _LINEAR(x, *given)
+        before = None if norm is None else OwnNorm(norm)
+        return OwnLinear(packed_weights(layer), layer.out_features, gelu=gelu, norm=before)
 
     def norm(self, norm: nn.LayerNorm) -> Layer:
         """A layer norm."""
-        parameters = norm_parameters(norm)
-        return lambda x: _NORM(x, parameters, norm.eps)
+        return OwnNorm(norm)
 
     def blocks(self, blocks: Sequence[Any]) -> Blocks:
         """The blocks of a stage: one operator, if all of them have window attention."""
         if not blocks or not all(_has_windows(block.attn) for block in blocks):
             return OneDNN(torch.float32).blocks(blocks)
-        parameters, *given = packed_blocks(blocks)
-
-        def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-            x = x.contiguous()
-            _BLOCKS(x, parameters, tables, *given)
-            return x
-
-        return run
+        return OwnBlocks(blocks)
 
 
 class OneDNN(Own):
@@ -210,11 +190,6 @@ def library(layer: nn.Module, dtype: torch.dtype) -> Own:
     """The library that computes a layer, or a part of a model, fastest here."""
     own = dtype == torch.float32 and (not quantized_layers(layer) or has_own_int8())
     return Own() if own else OneDNN(dtype)
-
-
-def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
-    """The quantization of what the layer with this name takes; None if it is not quantized."""
-    return quantized_layers(module).get(name)
 
 
 def _has_windows(attn: nn.Module) -> bool:

@@ -1,7 +1,7 @@
 """The points at which models, layers and views read an image."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ class Reading(NamedTuple):
     """The points at which images of one size are read, and the usual form of the result."""
 
     points: PolarGrid | Tensor  # the polar grid of one lens, or pixels (H', W', 2)
-    output: str  # of `Plan`
+    output: Literal["tokens", "image"]  # of `Plan`
     samples: Pair | None  # (S_r, S_φ) of a token of the grid
     channels: int | None  # of the frames, if the sampling says it
     # The normalization of frames; None if the sampling has none of its own.
@@ -27,16 +27,20 @@ class Reading(NamedTuple):
 
 
 @torch.no_grad()
-def reading(sample: nn.Module, lens: Lens, size: Pair) -> Reading:
-    """The points at which a model, a layer or a view reads images of (H, W)."""
-    if len(check_lens(lens, size)) != 1:
+def reading(sample: nn.Module, lens: Lens | None, size: Pair, *, exact: bool = True) -> Reading:
+    """The points at which a model, a layer or a view reads images of (H, W).
+
+    The points of views are as exact as can be; or, without `exact`, those at which a model itself
+    reads. A polar grid is always the model's own: its samples have the bits of `polar_sample`.
+    """
+    lens = check_lens(lens, size)
+    if len(lens) != 1:
         raise ValueError(f"a plan needs one lens, got {len(lens)}")
     view = sample.view if isinstance(sample, Model) else sample
     if not isinstance(view, View):
         raise TypeError(f"sample must be a model or a view of darswin, got {type(sample).__name__}")
     channels = sample.in_chans if isinstance(sample, Model) else None
-    # A polar grid has the bits of `polar_sample`; the points of views are as exact as can be.
-    dtype = torch.float64 if isinstance(view, PixelView) else lens.theta_max.dtype
+    dtype = torch.float64 if exact and isinstance(view, PixelView) else lens.theta_max.dtype
     points = view.prepare(lens.to("cpu", dtype), size, back=False, rays=False).points
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
@@ -45,3 +49,10 @@ def reading(sample: nn.Module, lens: Lens, size: Pair) -> Reading:
     assert isinstance(points, Tensor)
     reads = view.reads_of(size) if isinstance(view, PixelView) else 1
     return Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)
+
+
+def every_pixel(model: Model, size: Pair) -> Reading:
+    """The points of a model that takes images of (H, W) as they are."""
+    y, x = (torch.arange(side, dtype=torch.float64) for side in size)
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    return Reading(points, "image", None, model.in_chans, model.mean, model.std)

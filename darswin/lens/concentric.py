@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.lens.pixels import OUTSIDE, as_map, pixel_rays, sample_at
+from darswin.lens.pixels import OUTSIDE, as_map, pixel_rays
 from darswin.lens.spacing import Spacing, span, to_spacing, to_theta
 from darswin.ops.checks import tensor_there
 
@@ -107,13 +107,13 @@ def points_at(
     return torch.where(seen[..., None], points, OUTSIDE)
 
 
-def read_square(square: Tensor, points: Tensor) -> Tensor:
-    """Samples squares (B, C, S, S) at points (B or 1, H, W, 2), bilinearly: (B, C, H, W).
+def square_pixels(points: Tensor, size: tuple[int, int]) -> Tensor:
+    """Points (B or 1, H, W, 2) of a square → pixels of its map of (H', W').
 
-    The outermost pixels extend to the square's edge. `OUTSIDE` gives 0.
+    The outermost pixels extend to the square's edge. `OUTSIDE` stays.
     """
-    height, width = square.shape[2:]
-    size = tensor_there((width, height), points)
-    pixels = ((points + 1) * size - 1) / 2
-    inside = torch.minimum(pixels.clamp(min=0), size - 1)
-    return sample_at(square, torch.where(points == OUTSIDE, OUTSIDE, inside))
+    height, width = size
+    sides = tensor_there((width, height), points)
+    pixels = ((points + 1) * sides - 1) / 2
+    inside = torch.minimum(pixels.clamp(min=0), sides - 1)
+    return torch.where(points == OUTSIDE, OUTSIDE, inside)

@@ -1,7 +1,7 @@
 """The operators.
 
-On the CPU they run compiled code. On other devices, and within `use_reference`, they run the
-PyTorch reference.
+On the CPU they run compiled code. On other devices, within `use_reference`, and where the compiled
+module cannot be loaded, they run the PyTorch reference.
 
 They use as many threads as torch. A process that is forked after such a call must not call them
 with several threads: use `spawn`, or `torch.set_num_threads(1)` in the child.

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,21 +10,24 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.autograd import forward_ad
 
+from darswin.ops import _module
+
 transformed = torch._C._are_functorch_transforms_active  # True within a transform of torch.func
 _LIBRARY = torch.library.Library("darswin", "IMPL")
-_reference = False
+_reference = _module.LACK is not None
 
 
 @contextlib.contextmanager
 def use_reference(enabled: bool = True) -> Iterator[None]:
     """Makes the operators run their PyTorch reference on every device within this context.
 
-    The reference defines each operator in plain steps and has all derivatives.
+    The reference defines each operator in plain steps and has all derivatives. Without the compiled
+    module it always runs.
 
     The switch holds for the whole process, not for one thread.
     """
     global _reference
-    before, _reference = _reference, enabled
+    before, _reference = _reference, enabled or _module.LACK is not None
     try:
         yield
     finally:
@@ -31,8 +35,22 @@ def use_reference(enabled: bool = True) -> Iterator[None]:
 
 
 def reference_in_use() -> bool:
-    """True within `use_reference`."""
+    """True within `use_reference`, and without the compiled module."""
     return _reference
+
+
+def operator(name: str) -> Any:
+    """An operator of the compiled module. Without the module, it refuses calls."""
+    if _module.LACK is not None:
+        return partial(_module.require, name)
+    return getattr(torch.ops.darswin, name).default
+
+
+def register_fake(name: str) -> Callable[[Callable], Callable]:
+    """Registers the decorated function as the fake of an operator, if the module is loaded."""
+    if _module.LACK is not None:
+        return lambda fake: fake
+    return torch.library.register_fake(f"darswin::{name}")
 
 
 def _has_autocast(device: str) -> bool:
@@ -99,8 +117,9 @@ def register_gradients(name: str, groups: dict[int, int]) -> None:
     of the output, and a bool for each group: whether a gradient of this group is wanted. A
     backward operator without these bools computes all gradients.
     """
-    operators = torch.ops.darswin
-    backward = getattr(operators, f"{name}_backward").default
+    if _module.LACK is not None:  # torch differentiates the reference
+        return
+    backward = operator(f"{name}_backward")
     names = [argument.name for argument in backward._schema.arguments]
     taken = names.index("grad_out")
     bools = len(names) - taken - 1
@@ -125,9 +144,9 @@ def register_gradients(name: str, groups: dict[int, int]) -> None:
     def fake_backward(*arguments):
         return empty_gradients(arguments, groups, arguments[taken + 1 :])
 
-    _register_autograd(getattr(operators, name).default, f"darswin.{name}", gradients)
+    _register_autograd(operator(name), f"darswin.{name}", gradients)
     _register_autograd(backward, f"{name}'s backward", second_derivative)
-    torch.library.register_fake(f"darswin::{name}_backward", fake_backward)
+    register_fake(f"{name}_backward")(fake_backward)
 
 
 def _register_autograd(operator: OpOverload, title: str, gradients: Callable) -> None:

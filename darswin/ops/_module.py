@@ -1,15 +1,19 @@
 """Loads the operators of the compiled module `libdarswin.so` into torch and wraps its C functions.
 
-The module does not use Python's C API, so that one file works with every Python version.
+The module does not use Python's C API, so that one file works with every Python version. Where it
+cannot be loaded, `LACK` says why, and the operators run their PyTorch reference.
 """
 
 import ctypes
 import json
+import multiprocessing
+import warnings
 from pathlib import Path
 
-import torch  # before the module: both must share the libgomp that torch loads
+import torch
 
 FILE = Path(__file__).parent.parent / "libdarswin.so"
+REFERENCE = "reference"  # the name of the only tier without the module
 
 
 def load() -> ctypes.CDLL:
@@ -20,6 +24,11 @@ def load() -> ctypes.CDLL:
             f"Python imports darswin from its source code in {checkout}, which has no compiled "
             "module. Build it with `make build` or `pip install --no-build-isolation -e .`, or "
             "start Python in another folder to import an installed package."
+        )
+    if not FILE.exists():
+        raise ImportError(
+            f"the installed darswin has no compiled module, {FILE}: its wheel is the one for "
+            "systems and processors without such a module"
         )
     try:
         torch.ops.load_library(FILE)
@@ -36,34 +45,66 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_allow_fours.argtypes = [ctypes.c_bool]
+    module.darswin_allow_fours.restype = ctypes.c_bool
     return module
+
+
+def require(what: str) -> None:
+    """Raises ImportError if `what` cannot run, because there is no compiled module."""
+    if LACK is not None:
+        raise ImportError(f"{what} needs the compiled module of darswin: {LACK}")
 
 
 def cpu_capability() -> str:
     """The instruction-set tier that the operators run on: "generic", "avx2", "avx512" or "neon".
 
     By default it is the best tier of this CPU. The environment variable ATEN_CPU_CAPABILITY
-    (default, avx2, avx512) lowers it, as in torch. ARM CPUs have only "neon".
+    (default, avx2, avx512) lowers it, as in torch. ARM CPUs have only "neon". Where the compiled
+    module cannot be loaded, it is "reference": the operators run their PyTorch reference.
     """
-    return _loaded.darswin_tier().decode()
+    return REFERENCE if _loaded is None else _loaded.darswin_tier().decode()
 
 
 def tiers() -> list[str]:
     """The tiers that this CPU and this build support, from low to high."""
-    return _loaded.darswin_tiers().decode().split()
+    return [REFERENCE] if _loaded is None else _loaded.darswin_tiers().decode().split()
 
 
 def set_tier(tier: str) -> None:
     """Switches the operators to another tier. Raises ValueError if the CPU lacks it."""
-    if not _loaded.darswin_set_tier(tier.encode()):
+    found = tier == REFERENCE if _loaded is None else _loaded.darswin_set_tier(tier.encode())
+    if not found:
         raise ValueError(
             f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
         )
 
 
+def allow_fours(allowed: bool) -> bool:
+    """Says whether 8-bit layers may use instructions for four bytes at a time, such as VNNI.
+
+    They may at first. The results are the same. Returns True if the CPU and the tier have them, and
+    they are allowed.
+    """
+    return False if _loaded is None else _loaded.darswin_allow_fours(allowed)
+
+
 def build_info() -> dict[str, str | int]:
-    """Facts about the module's build: compiler, cxx_standard, openmp, torch_abi."""
-    return json.loads(_loaded.darswin_build_info())
+    """Facts about the module's build: compiler, cxx_standard, torch_abi."""
+    return {"compiler": "none"} if _loaded is None else json.loads(_loaded.darswin_build_info())
 
 
-_loaded = load()
+_loaded: ctypes.CDLL | None = None
+LACK: str | None = None
+try:
+    _loaded = load()
+except ImportError as error:
+    LACK = str(error)
+    if multiprocessing.parent_process() is None:  # else the parent has said so
+        warnings.warn(
+            f"{LACK.removesuffix('.')}. The operators now run their PyTorch reference, which gives "
+            "the same results but is slower. `darswin.optimize` and `darswin.frames` need the "
+            "compiled modules.",
+            RuntimeWarning,
+            stacklevel=2,
+        )

@@ -17,7 +17,7 @@ from darswin.ops._sampling import (
 )
 from darswin.ops.checks import LAYOUTS, channels_first, check_layout, check_pair, per_channel
 
-_SAMPLE = torch.ops.darswin.polar_sample.default
+_SAMPLE = _library.operator("polar_sample")
 
 
 def polar_sample(
@@ -120,7 +120,7 @@ def _reference(*arguments):
     return reference.polar_sample(Sampling(*fields), tokens)
 
 
-@torch.library.register_fake("darswin::polar_sample")
+@_library.register_fake("polar_sample")
 def _fake(*arguments):
     check_sampling(*arguments)
     *fields, tokens = arguments

@@ -8,8 +8,8 @@ from torch import Tensor
 from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_layout, check_pair, check_rising, check_tensor
 
-_TO_IMAGE = torch.ops.darswin.polar_to_image.default
-_PLAN = torch.ops.darswin._polar_to_image_plan.default
+_TO_IMAGE = _library.operator("polar_to_image")
+_PLAN = _library.operator("_polar_to_image_plan")
 
 
 def polar_to_image(
@@ -137,7 +137,7 @@ def _check(x, radii, center, affine, points, r_max, size, tokens=False, plan=Non
     check_rising("radii", radii)
 
 
-@torch.library.register_fake("darswin::polar_to_image")
+@_library.register_fake("polar_to_image")
 def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
     _check(x, radii, center, affine, points, r_max, size, tokens, plan)
     (batch, _, _, channels), (height, width) = x.shape, size
@@ -146,7 +146,7 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
     )
 
 
-@torch.library.register_fake("darswin::_polar_to_image_plan")
+@_library.register_fake("_polar_to_image_plan")
 def _fake_plan(x, radii, center, affine, points, r_max, size):
     _check(x, radii, center, affine, points, r_max, size)
     lens = (radii, center, affine, points, r_max)

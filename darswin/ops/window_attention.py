@@ -6,7 +6,7 @@ from torch import Tensor
 from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_pair, check_tensor
 
-_ATTENTION = torch.ops.darswin.window_attention.default
+_ATTENTION = _library.operator("window_attention")
 
 
 def window_attention(
@@ -82,7 +82,7 @@ def _check(qkv, bias, window, shift, *others) -> None:
     check_tensor("bias", bias, (real,), form, (batch, *table), (1, *table), like=qkv)
 
 
-@torch.library.register_fake("darswin::window_attention")
+@_library.register_fake("window_attention")
 def _fake(qkv, bias, window, shift, periodic, scale):
     _check(qkv, bias, window, shift)
     batch, rings, sectors, _, heads, head_dim = qkv.shape

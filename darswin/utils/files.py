@@ -2,12 +2,18 @@
 
 import contextlib
 import errno
-import fcntl
 import os
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 _PARTIAL = ".partial"
 _NO_FILES = {
@@ -73,7 +79,7 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
         except OSError as error:
             if error.errno in (errno.EACCES, errno.EAGAIN):
                 raise BlockingIOError(
@@ -81,3 +87,12 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
                 ) from None
             # Some network file systems have no locks: continue without one.
         yield
+
+
+def _lock(file: IO) -> None:
+    """OSError: another process holds the lock, or the file system has none."""
+    if sys.platform == "win32":
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # the first byte, which need not exist
+    else:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

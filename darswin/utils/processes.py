@@ -35,8 +35,10 @@ def die_with_first_process() -> Iterator[None]:
 
 
 def die_with_parent(parent: int) -> None:
-    """Lets this process die together with its parent, even by a kill; SystemExit: it is dead."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    """Lets this process die together with its parent, even by a kill; SystemExit: it is dead. Only
+    Linux can do this; elsewhere the process lives on."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         raise SystemExit(1)
 

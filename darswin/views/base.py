@@ -285,11 +285,15 @@ class PixelView(View):
         return sample_at(images, prepared.points)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        return sample_at(maps, self.back_points(prepared, (maps.shape[2], maps.shape[3])))
+
+    def back_points(self, prepared: Prepared, size: Pair) -> Tensor:
+        """The pixels of a map of this size that `back` brings to the pixels of the images,
+        (N, H, W, 2)."""
         assert isinstance(prepared.back, Tensor) and self.size is not None
-        points, size = prepared.back, (maps.shape[2], maps.shape[3])
-        if size != self.size:
-            points = torch.where(points == OUTSIDE, OUTSIDE, self.scaled(points, size))
-        return sample_at(maps, points)
+        if size == self.size:
+            return prepared.back
+        return torch.where(prepared.back == OUTSIDE, OUTSIDE, self.scaled(prepared.back, size))
 
     def scaled(self, points: Tensor, size: Pair) -> Tensor:
         """Points of the view in a map of another size. Its outermost pixels extend to the edges."""

@@ -7,7 +7,7 @@ from darswin.lens import Lens
 from darswin.lens.concentric import (
     points_at,
     rays_at,
-    read_square,
+    square_pixels,
     square_points,
     square_rays,
     square_view,
@@ -84,9 +84,9 @@ class SquareView(PixelView):
         points = ((square + 1) * self.size[0] - 1) / 2
         return torch.where(square == OUTSIDE, torch.nan, points)
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+    def back_points(self, prepared: Prepared, size: Pair) -> Tensor:
         assert isinstance(prepared.back, Tensor)
-        return read_square(maps, prepared.back)
+        return square_pixels(prepared.back, size)
 
     def extra_repr(self) -> str:
         edge = "" if self.theta_max is None else f", theta_max={self.theta_max:g}"

@@ -36,6 +36,32 @@ def record() -> Record:
     )
 
 
+def paced(name, threads, p50, p99, *, ratio=1.0, target=None, frame="float32, fixed lens"):
+    case = ("darswin_a_nano", "64×64", 1, threads, f"paced, {frame}")
+    seconds = (1e-3 * p50, 0.0, ratio, target, 100, 1e-3 * p99, 2e-3 * p50)
+    return Timing(*case, name, *seconds)
+
+
+@pytest.fixture
+def camera() -> list[Timing]:
+    """Single frames, in a loop and at the pace of a camera."""
+    loop = [
+        timing(OURS, 0.4, mode="forward", batch=1),
+        timing("peer", 0.5, mode="forward", batch=1),
+    ]
+    for t in loop:
+        t.mode = "forward, float32, fixed lens"
+    return [
+        *loop,
+        *(
+            paced(OURS, n, p50, p99)
+            for n, p50, p99 in ((1, 1.0, 1.4), (2, 0.9, 2.0), (0, 1.5, 1.3))
+        ),
+        *(paced("peer", n, 2.0, 2500.0, ratio=2.0) for n in (1, 2, 0)),
+        paced(OURS, 1, 3.0, 4.0, frame="float32, from an uint8 frame"),
+    ]
+
+
 def operator(name, threads, milliseconds, ratio=1.0, target=None, subject="polar_sample"):
     case = (subject, "64×64", 8, threads, "forward")
     return Timing(*case, name, 1e-3 * milliseconds, 0.0, ratio, target)

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from darswin.bench.record import Record
+from darswin.bench.start import Start
 from darswin.bench.timing import OURS, Case
 from darswin.ops import _module, cpu_capability
 
@@ -73,3 +74,33 @@ def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, monkeypatch):
     assert Record.load(path).timings == found
     printed = capsys.readouterr().out
     assert "| `double` | ours (ms) | peer |" in printed and printed.count("MISSED") >= 4
+
+
+def test_a_candidate_gets_its_threads_before_the_first_frame():
+    seen, before = [], torch.get_num_threads()
+    on = peers.on_torch_threads(lambda: seen.append(torch.get_num_threads()))
+    try:
+        for threads in (2, 1, 2, 0):
+            on(threads)()
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [2, 1, 2, max(peers.THREADS)]
+
+
+def test_a_suite_has_frames_at_a_cameras_pace_too(tmp_path, capsys, camera, monkeypatch):
+    monkeypatch.setattr(peers, "THREADS", [1, 2])
+    starts = [Start("nano", OURS, 0.2, 2**25)]
+    before = torch.get_num_threads()
+
+    def job():
+        assert torch.get_num_threads() == 2
+        torch.set_num_threads(1)
+        return camera
+
+    found = peers.run_suite("suite", [], 1.0, tmp_path, paced=[job], starts=[lambda: starts])
+    assert found == camera and torch.get_num_threads() == before
+    (path,) = tmp_path.glob("suite--*.json")
+    assert Record.load(path).timings == camera and Record.load(path).starts == starts
+    printed = capsys.readouterr().out
+    assert "p50 / p99 / CPU time, ms" in printed and "0.20 s, 32 MB" in printed
+    assert printed.count("p50 over p99") == 4 and "MB 32.00 (target 60.00)" in printed

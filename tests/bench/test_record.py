@@ -1,4 +1,7 @@
+import json
+
 from darswin.bench.record import Record, write
+from darswin.bench.start import Start
 
 
 def test_a_record_and_its_plot(record, tmp_path, capsys):
@@ -28,3 +31,18 @@ def test_a_record_has_a_line_for_each_row(tmp_path):
         "{", ' "size": 3,', ' "parts": {', '  "a": [1, 2],', '  "b": null', " },", ' "cells": [',
         '  {"x": 0.1},', '  {"x": 1e-09}', " ]", "}",
     ]  # fmt: skip
+
+
+def test_records_of_frames_and_those_from_before_them_are_read(record, camera, tmp_path):
+    path, starts = tmp_path / "record.json", [Start("nano", "darswin", 0.25, 2**25)]
+    found = Record(record.machine, camera, starts=starts)
+    found.save(path)
+    assert Record.load(path) == found
+    content = json.loads(path.read_text())
+    del content["starts"]
+    for row in content["timings"]:
+        row.pop("cpu", None)
+    path.write_text(json.dumps(content))
+    old = Record.load(path)
+    assert old.starts == [] and {t.cpu for t in old.timings} == {None}
+    assert [t.median for t in old.timings] == [t.median for t in camera]

@@ -1,6 +1,7 @@
 import peers
 
 from darswin.bench import tables
+from darswin.bench.start import Start
 from darswin.bench.tables import BOTH
 
 
@@ -49,4 +50,52 @@ def test_a_column_for_each_cpu(operators, record):
         "|---|---|---|---|---|",
         "| `polar_sample`, forward, 64×64, batch 8 | 1.00 | 6.0× |  |  |",
         "| `another`, forward, 64×64, batch 8 | 1.00 | 1.0× |  |  |",
+    ]
+
+
+def test_frames_of_a_camera(camera):
+    case, frame = "`darswin_a_nano`, 64×64, float32, fixed lens", "float32, from an uint8 frame"
+    assert tables.paced_table(camera).splitlines() == [
+        "| p50 / p99 / CPU time, ms | darswin | peer |",
+        "|---|---|---|",
+        f"| {case}, 1 thread | 1 / 1.4 / 2 | 2 / 2500 / 4 |",
+        f"| {case}, 2 threads | 0.9 / 2 / 1.8 | 2 / 2500 / 4 |",
+        f"| {case}, default threads | 1.5 / 1.3 / 3 | 2 / 2500 / 4 |",
+        f"| `darswin_a_nano`, 64×64, {frame}, 1 thread | 3 / 4 / 6 |  |",
+    ]
+    assert peers.frames_table(camera, ["peer"]).splitlines()[2:] == [
+        "| `darswin_a_small`, 64×64, batch 1 | 0.40 | 1.00× |"
+    ]
+    assert peers.latency_table(camera, ["peer"]).splitlines()[2:] == [
+        f"| `darswin_a_nano`, 64×64, float32 | 1.00{BOTH}0.90 | 2.00{BOTH}2.00 |"
+    ]
+    assert peers.camera_table(camera, ["peer"]).splitlines() == [
+        "| one frame every 33 ms: p50 (p99) | `darswin_a_nano` |",
+        "|---|---|",
+        "| darswin | 1.50 (1.30) |",
+        "| peer | 2.00 (2500.00) |",
+    ]
+
+
+def test_records_of_loops_alone_have_tables_too(camera):
+    loops = [t for t in camera if not t.paced]
+    assert tables.paced_table(loops).count("\n") == 1
+    assert peers.latency_table(loops, ["peer"]).splitlines()[2:] == [
+        "| `darswin_a_small`, 64×64, float32 | 0.40 | 0.50 |"
+    ]
+    assert peers.camera_table(loops, ["peer"]).splitlines() == [
+        "| one frame in a loop: p50 (p99) | `darswin_a_small` |",
+        "|---|---|",
+        "| darswin | 0.40 (0.80) |",
+        "| peer | 0.50 (1.00) |",
+    ]
+
+
+def test_first_answers():
+    starts = [Start("nano", "ours", 0.256, 3 * 2**20), Start("micro", "peer", 1.0, 2**30)]
+    assert tables.starts_table(starts).splitlines() == [
+        "| first answer | ours | peer |",
+        "|---|---|---|",
+        "| `nano` | 0.26 s, 3 MB |  |",
+        "| `micro` |  | 1.00 s, 1024 MB |",
     ]

@@ -18,8 +18,6 @@ from darswin.cli.main import main
 from darswin.layers.linear import onednn_lack
 from darswin.models import DarSwin
 
-INT8 = ["int8"] if onednn_lack(torch.int8) is None else []
-
 
 @pytest.mark.slow
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
@@ -37,7 +35,7 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     assert path.with_suffix(".png").exists()
     record = Record.load(path)
     both = [(m, d) for m in ("inference", "training") for d in ("float32", "bfloat16")]
-    modes = both + [("inference", dtype) for dtype in INT8]
+    modes = [*both, ("inference", "int8")]
     found: dict[tuple[str, int], set[str]] = {}
     for t in record.timings:
         assert (t.subject, t.setting, t.threads, t.target) == ("darswin_a_nano", "32×32", 1, None)

@@ -19,19 +19,25 @@ from darswin.lens import Equidistant
 pytestmark = pytest.mark.slow
 EXAMPLE = Path(__file__).parents[2] / "examples" / "camera.py"
 SIZE = (96, 128)
+LABELS = ["ant", "bee", "cat", "dog"]
+GRAPH = ["--graph", "camera.onnx"]
 
 
 @pytest.fixture(scope="module", params=[1, 3], ids=["gray", "rgb"])
 def folder(request, tmp_path_factory):
-    """A plan, a graph, a video, and the class of each frame by the whole model."""
+    """The network, a plan and a graph, a video, and the class of each frame by the whole model."""
     folder = tmp_path_factory.mktemp("camera")
     lens = Equidistant.from_fov(2.9, 60.0)
     options = dict(num_classes=4, depths=(1, 1), num_heads=(1, 2), in_chans=request.param)
     model = create_model("darswin_a_nano", **options, mean=0.4, std=0.2).eval()
     torch.nn.init.normal_(model.head.weight)
-    frames.plan(model, lens, SIZE).save(folder / "camera.npz")
+    frames.export(model, lens, SIZE, folder / "camera.npz")
+    frames.export(model, lens, SIZE, folder / "named.npz", labels=LABELS)
+    frames.plan(model, lens, SIZE).save(folder / "plan.npz")
     images = torch.zeros(1, request.param, *SIZE, dtype=torch.uint8)
     export_onnx(model, folder / "camera.onnx", images, lens, fixed_lens=True, input="tokens")
+    dense = create_model("darswin_unet_a_nano", num_classes=2, in_chans=request.param).eval()
+    frames.export(dense, lens, SIZE, folder / "dense.npz")
     classes = []
     write_video(folder / "camera.mp4", count=7, size=SIZE)
     video = cv2.VideoCapture(str(folder / "camera.mp4"))
@@ -51,13 +57,16 @@ def run(folder, *arguments, video="camera.mp4"):
     )  # fmt: skip
 
 
-def test_classes_are_those_of_the_whole_model(folder):
+@pytest.mark.parametrize("arguments", [[], ["--network", "named.npz"], GRAPH])
+def test_classes_are_those_of_the_whole_model(folder, arguments):
     folder, classes = folder
-    done = run(folder, "--threads", "2")
+    done = run(folder, "--threads", "2", *arguments)
     assert done.returncode == 0, done.stderr
-    found = re.findall(r"frame (\d+): class (\d)", done.stdout)
-    assert [(int(n), int(k)) for n, k in found] == [*enumerate(classes)][::2] and len(classes) == 7
-    assert re.search(r"\d+ frames per second: sampling [\d.]+ ms, network [\d.]+ ms", done.stdout)
+    names = LABELS if "named.npz" in arguments else [*map(str, range(4))]
+    found = re.findall(r"frame (\d+): class (\w+)", done.stdout)
+    expected = [(str(n), names[best]) for n, best in enumerate(classes)][::2]
+    assert found == expected and len(classes) == 7
+    assert re.search(r"\d+ frames per second: [\d.]+ ms per frame, [\d.]+ ms at most", done.stdout)
 
 
 def test_wrong_files_are_explained_in_one_sentence(folder, tmp_path):
@@ -74,23 +83,32 @@ def test_wrong_files_are_explained_in_one_sentence(folder, tmp_path):
     )
     write_video(tmp_path / "small.mp4", count=2, size=(64, 64))
     for arguments, video, words in [
-        (["--plan", tmp_path / "cut.npz"], "camera.mp4", "no plan of darswin.frames"),
-        (["--plan", tmp_path / "none.npz"], "camera.mp4", "No such file"),
+        (["--network", tmp_path / "cut.npz"], "camera.mp4", "cut.npz"),
+        (["--network", tmp_path / "none.npz"], "camera.mp4", "No such file"),
+        (["--network", "plan.npz"], "camera.mp4", "plan.npz"),
+        (["--network", "dense.npz"], "camera.mp4", "dense.npz is no classifier"),
+        ([*GRAPH, "--plan", tmp_path / "cut.npz"], "camera.mp4", "no plan of darswin.frames"),
+        ([*GRAPH, "--plan", tmp_path / "none.npz"], "camera.mp4", "No such file"),
         (["--graph", tmp_path / "noise.onnx"], "camera.mp4", "no ONNX file"),
         (["--graph", tmp_path / "other.onnx"], "camera.mp4", "no graph of a darswin model"),
         ([], tmp_path / "none.mp4", "cannot read the video"),
-        ([], tmp_path / "small.mp4", r"the plan's size, (H, W) = (96, 128), got (64, 64)"),
+        ([], tmp_path / "small.mp4", "(96, 128)"),
+        (GRAPH, tmp_path / "small.mp4", r"the plan's size, (H, W) = (96, 128), got (64, 64)"),
     ]:
         done = run(folder, *map(str, arguments), video=str(video))
         assert done.returncode != 0 and "Traceback" not in done.stderr
         assert words in done.stderr, done.stderr
 
 
-def test_the_example_imports_no_torch(folder):
+def test_the_example_needs_neither_torch_nor_onnxruntime(folder):
     folder, _ = folder
     code = (
         "import runpy, sys; sys.argv = ['camera.py', 'camera.mp4']; "
-        f"runpy.run_path({str(EXAMPLE)!r}, run_name='__main__'); assert 'torch' not in sys.modules"
+        f"runpy.run_path({str(EXAMPLE)!r}, run_name='__main__'); "
+        "assert not {'torch', 'onnxruntime'} & sys.modules.keys(); "
+        "sys.argv += ['--graph', 'camera.onnx']; "
+        f"runpy.run_path({str(EXAMPLE)!r}, run_name='__main__'); "
+        "assert 'torch' not in sys.modules and 'onnxruntime' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True)
-    assert np.load(folder / "camera.npz")["output"] == "tokens"
+    assert np.load(folder / "plan.npz")["output"] == "tokens"

@@ -18,13 +18,12 @@ LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
 @pytest.mark.parametrize("lenses", [slice(0, 1), slice(0, 5)])
-def test_large_batches_go_in_parts(monkeypatch, name, lenses):
-    model, images = network(name), torch.randn(5, 3, 32, 32)
+def test_large_batches_go_in_parts(monkeypatch, lenses):
+    model, images = network("darswin_a_nano"), torch.randn(5, 3, 32, 32)
     lens = Spherical.from_fov([0.0, 0.2, 0.5, 0.7, 0.9], math.radians(160), 16.0)[lenses]
     want = model(images, lens)
-    image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
+    image = 256 * 4 * 24 * 2  # bytes of a hidden map of the first stage
     sizes = []
 
     def counted(run):
@@ -36,13 +35,28 @@ def test_large_batches_go_in_parts(monkeypatch, name, lenses):
 
     for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
         monkeypatch.setattr("darswin.deploy.fast.CACHED_BYTES", most)
-        fast = optimize(model)
+        fast = optimize(model, torch.bfloat16)
         for stage in fast.stages:
             stage.blocks = counted(stage.blocks)
         sizes.clear()
-        assert relative_error(fast(images, lens), want) < 1e-5
+        assert relative_error(fast(images, lens), want) < 0.05
         assert sizes[: len(parts)] == parts
         assert fast(images[:0], lens[:0] if len(lens) > 1 else lens).shape == (0, 5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano", "darswin_unet_a_nano"])
+@pytest.mark.parametrize("lenses", [1, 200])
+def test_large_batches_have_the_bits_of_small_ones(name, lenses):
+    fast = optimize(network(name))  # a part of a batch has at most 170 images
+    side = fast.image_size or (32, 32)
+    images = torch.randn(200, 3, *side)
+    lens = Spherical.from_fov(torch.linspace(0.1, 0.9, lenses), math.radians(160), side[0] / 2)
+    got = fast(images, lens)
+    for k in (0, 99, 100, 199):
+        assert torch.equal(
+            got[k : k + 1], fast(images[k : k + 1], lens[k : k + 1] if lenses > 1 else lens)
+        )
 
 
 @torch.no_grad()

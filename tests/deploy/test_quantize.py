@@ -25,9 +25,9 @@ from darswin.layers.quantized import (
 )
 from darswin.lens import Spherical
 from darswin.models import ModelCard, load_model, save_model
+from darswin.ops import _module
 
-HAS_INT8 = onednn_lack(torch.int8) is None
-needs_int8 = pytest.mark.skipif(not HAS_INT8, reason="this CPU has no products of 8 bits")
+HAS_VNNI = onednn_lack(torch.int8) is None  # or another exact product of bytes, for other libraries
 MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano",
           "darswin_unet_a_nano", "swin_unet_adapted_nano"]  # fmt: skip
 
@@ -71,17 +71,15 @@ def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
     images, lens = batch(8)
     want, got = flat(model(images, lens)), flat(quantized(images, lens))
     assert 0 < relative_error(got, want) < 0.15
-    if HAS_INT8:
-        fast = optimize(quantized, torch.int8)
-        # A rounding in float32 may move an activation by one step, and the layers after it let the
-        # difference grow, up to the error of 8 bits itself. An image without such a step is equal.
-        errors = (flat(fast(images, lens)) - got).norm(dim=1) / got.norm(dim=1)
-        assert errors.min() < 1e-5 and errors.max() < relative_error(got, want)
-        one = optimize(quantized, torch.int8, lens=lens[:1])
-        assert torch.equal(flat(one(images[:1])), flat(fast(images[:1], lens[:1])))
+    fast = optimize(quantized, torch.int8)
+    # A rounding in float32 may move an activation by one step, and the layers after it let the
+    # difference grow, up to the error of 8 bits itself. An image without such a step is equal.
+    errors = (flat(fast(images, lens)) - got).norm(dim=1) / got.norm(dim=1)
+    assert errors.min() < 1e-5 and errors.max() < relative_error(got, want)
+    one = optimize(quantized, torch.int8, lens=lens[:1])
+    assert torch.equal(flat(one(images[:1])), flat(fast(images[:1], lens[:1])))
 
 
-@needs_int8
 @torch.no_grad()
 def test_calibration_and_quantized_models_come_to_the_same():
     model, seen = network(), batch()
@@ -93,13 +91,13 @@ def test_calibration_and_quantized_models_come_to_the_same():
     assert relative_error(direct(images[:1], lens[:1]), direct(images, lens)[:1]) < 1e-5
 
 
-@needs_int8
+@pytest.mark.skipif(not HAS_VNNI, reason="oneDNN has no products of 8 bits")
 @torch.no_grad()
 def test_without_own_kernels_onednn_computes_the_same(monkeypatch):
     quantized, seen = quantize_model(network(), [batch()]), batch()
     want = optimize(quantized, torch.int8)(*seen)
     monkeypatch.setattr("darswin.deploy.packed.has_own_int8", lambda: False)
-    monkeypatch.setattr("darswin.deploy.packed.packed_blocks", None)
+    monkeypatch.setattr("darswin.deploy.packed.OwnBlocks", None)
     assert relative_error(optimize(quantized, torch.int8)(*seen), want) < 0.005
 
 
@@ -168,9 +166,8 @@ def test_layers_that_cannot_go_together_are_named():
     ):
         model = network(name)
         with_quantized_layers(model, {layer: steps})
-        if HAS_INT8:
-            with pytest.raises(ValueError, match=message):
-                optimize(model, torch.int8)
+        with pytest.raises(ValueError, match=message):
+            optimize(model, torch.int8)
 
 
 def test_what_is_to_stay_stays():
@@ -185,7 +182,7 @@ def test_what_is_to_stay_stays():
     for wrong in ("stages.9", [""]):
         with pytest.raises(ValueError, match=r"keep: the model has no module named (stages\.9)?"):
             quantize_model(model, [seen], keep=wrong)
-    for keep in ("attn.qkv", "attn.proj", "mlp", "norm1") * HAS_INT8:
+    for keep in ("attn.qkv", "attn.proj", "mlp", "norm1"):
         names = [name for name, _ in model.named_modules() if name.endswith(keep)]
         quantized = quantize_model(model, [seen], keep=names, tolerance=math.inf)
         with torch.no_grad():
@@ -218,18 +215,25 @@ def test_fastest(monkeypatch):
         if onednn_lack(dtype) is None:
             assert torch.equal(optimize(model, "fastest")(*seen), optimize(model, dtype)(*seen))
     monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
-    if HAS_INT8:
-        want = optimize(quantized, torch.int8)(*seen)
-        assert torch.equal(optimize(quantized, "fastest")(*seen), want)
-        assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
-    # Elsewhere the weights are those of 8 bits, in float32.
+    want = optimize(quantized, torch.int8)(*seen)
+    assert torch.equal(optimize(quantized, "fastest")(*seen), want)
+    assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
+
+
+@torch.no_grad()
+def test_8_bits_without_vnni(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: True)
+    assert packed.has_own_int8() != HAS_VNNI
     monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: False)
     monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
-    with pytest.raises(RuntimeError, match=r'no VNNI.*optimize\(model, "fastest"\)'):
-        optimize(quantized, torch.int8)
-    got = optimize(quantized, "fastest")(*seen)
-    assert relative_error(got, quantized(*seen)) < 0.05
-    assert quantized_layers(quantized)
+    assert packed.has_own_int8()
+    quantized, seen = quantize_model(network(), [batch()]), batch()
+    want = optimize(quantized, torch.int8)(*seen)
+    try:
+        assert not _module.allow_fours(False)
+        assert torch.equal(optimize(quantized, torch.int8)(*seen), want)
+    finally:
+        _module.allow_fours(True)
 
 
 def test_fastest_dtype_is_measured(monkeypatch):
@@ -267,7 +271,8 @@ def test_wrong_arguments():
     for given, dtype, calibration in (
         (quantized, torch.float32, None),
         (model, torch.bfloat16, [seen]),
-        *((model, torch.int8, None), (quantized, torch.int8, [seen])) * HAS_INT8,
+        (model, torch.int8, None),
+        (quantized, torch.int8, [seen]),
     ):
         with pytest.raises(ValueError, match=r"quantized? model|quantize_model"):
             optimize(given, dtype, calibration=calibration)
@@ -335,7 +340,7 @@ def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
             assert torch.equal(steps, quantized.get_submodule(name).weight.int())
             overflows[name] = may_overflow(weight)
     assert set(overflows.values()) == {vnni_only}
-    if vnni_only and not HAS_INT8:
+    if vnni_only and not HAS_VNNI:
         return
     given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
     (logits,) = runtime.InferenceSession(path).run(None, {k: v.numpy() for k, v in given.items()})
@@ -359,7 +364,7 @@ def test_openvino_multiplies_with_8_bits_in_files_for_vnni(vnni_only, tmp_path):
     nodes = [op.get_rt_info() for op in compiled.get_runtime_model().get_ordered_ops()]
     products = [n["primitiveType"].value for n in nodes if n["layerType"].value == "FullyConnected"]
     in_8_bits = [product for product in products if product.endswith("I8")]
-    expected = len(quantized_layers(quantized)) if vnni_only and HAS_INT8 else 0
+    expected = len(quantized_layers(quantized)) if vnni_only and HAS_VNNI else 0
     assert len(in_8_bits) == expected
     given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
     logits = torch.from_numpy(compiled({k: v.numpy() for k, v in given.items()})["logits"])

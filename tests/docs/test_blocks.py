@@ -28,7 +28,7 @@ from helpers import fixture
 from scenes import write_outlines, write_plain, write_woodscape
 from videos import write_video
 
-from darswin import lens
+from darswin import frames, lens
 from darswin.cli.bench import bench
 from darswin.cli.main import main
 from darswin.viz.report import largest_offset
@@ -200,6 +200,12 @@ def check_classify(arguments: list[str], monkeypatch) -> None:
     assert shown in (ROOT / "docs/tutorials/deploy.md").read_text()
 
 
+def check_frame(arguments: list[str], monkeypatch) -> None:
+    """The files were written by the page, and fit each other."""
+    network, picture = arguments
+    assert frames.Network(network)(cv2.imread(picture)[..., ::-1]).ndim == 1
+
+
 def write_rooms(arguments: list[str], monkeypatch) -> None:
     """Runs the program that the page names, for a few pictures."""
     monkeypatch.setattr(sys, "argv", [*arguments, "--count", "12"])
@@ -223,6 +229,7 @@ def run_program(arguments: list[str], monkeypatch) -> None:
 
 PROGRAMS: dict[str, Callable] = {
     "build/classify/classify": check_classify,
+    "build/cpp/frame": check_frame,
     "cmake": check_cmake,
     "darswin": run_darswin,
     "make": check_make,

@@ -77,11 +77,12 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
 
 def test_one_frame_is_faster_than_in_other_runtimes():
     (record,) = fill.records("one_frame").values()
+    loops = [t for t in record.timings if not t.paced]
     for peer, least in (("eager model", 1.05), ("ONNX Runtime", 1.1), ("OpenVINO", 1.1)):
-        in_float32 = [t for t in record.timings if t.batch == 1 and "float32" in t.mode]
+        in_float32 = [t for t in loops if t.batch == 1 and "float32" in t.mode]
         found = [t.ratio for t in in_float32 if t.name == peer]
         assert len(found) == 8 and min(found) > least
-    in_8_bits = [t for t in record.timings if t.name == "float32" and "int8" in t.mode]
+    in_8_bits = [t for t in loops if t.name == "float32" and "int8" in t.mode]
     assert len(in_8_bits) == 8 and min(t.ratio for t in in_8_bits) > 1.5
 
 

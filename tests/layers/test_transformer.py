@@ -209,6 +209,7 @@ class Count(TorchDispatchMode):
         return operator(*args, **(kwargs or {}))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("backend", ["torch", "onednn"])
 def test_products_are_kept_and_what_is_cheap_is_computed_again(backend):
     stage = stage_of(drop_path=0.5)

@@ -122,6 +122,7 @@ def test_a_model_tells_once_that_floats_are_no_pixels(kind, dtype):
     assert len(told(lambda: other.run(pixels, prepared))) == 1
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 def test_only_the_first_calls_look_at_the_values():
     model, frames, lens = made("darswin_a_nano")

@@ -139,6 +139,7 @@ def test_one_preparation_serves_many_runs_and_the_reference_agrees(case):
             assert_close(out, model(planes, lens), 1e-3)
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 @cases
 def test_pixels_that_were_sampled_already_give_the_same_results(case):
@@ -242,6 +243,7 @@ OPTIONS = [
 ]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("name", "options"), OPTIONS, ids=str)
 def test_options_train_and_agree_with_the_reference(name, options):
     model = network(name, **options).train()
@@ -270,6 +272,7 @@ def test_a_batch_is_one_image_after_the_other_and_may_be_empty(case):
             assert empty.shape == (0, *out.shape[1:])
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 @cases
 def test_optimized_it_is_the_same(case):
@@ -625,6 +628,7 @@ def stages_that_run(model, call):
     return ran, out
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 @pytest.mark.parametrize("optimized", [False, True])
 @pytest.mark.parametrize("name", NANO_ENCODERS)
@@ -663,6 +667,7 @@ def test_the_intermediates_that_timm_gives(name, optimized):
         assert ran == [0, 1, 2]
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 @pytest.mark.parametrize("name", NANO_ENCODERS)
 def test_pruning_and_feature_maps(name):

@@ -38,6 +38,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
 
 
+@pytest.mark.compiled
 @torch.no_grad()
 @pytest.mark.parametrize("dtype", [torch.float32, f64])
 def test_prepare_keeps_a_plan_for_a_single_lens(dtype):

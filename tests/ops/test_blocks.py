@@ -8,7 +8,9 @@ import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
 from torch import nn
 
-from darswin.deploy.packed import Own, norm_parameters, packed_blocks, packed_weights
+from darswin.deploy.own import norm_parameters, packed_weights
+from darswin.deploy.packed import Own, OwnBlocks
+from darswin.deploy.program import BLOCK, RUN
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
@@ -100,7 +102,7 @@ def test_linear_behind_a_norm():
     parameters, weights = norm_parameters(norm), packed_weights(linear)
     got = _linear(x, weights, 50, False, parameters, norm.eps)
     assert torch.equal(got, _linear(_norm(x, parameters, norm.eps), weights, 50, False))
-    with pytest.raises(RuntimeError, match="_blocks_"):
+    with pytest.raises(RuntimeError, match="_linear"):
         _linear(x, weights, 50, False, parameters[:, :36])
 
 
@@ -194,31 +196,31 @@ def test_wrong_arguments():
     weights, norm = packed_weights(layer(6, 4)), torch.ones(2, 6)
     x = torch.zeros(3, 6)
     for wrong in (x.double(), x[:, :5], x[:, :0], torch.zeros(())):
-        with pytest.raises(RuntimeError, match="_blocks_"):
+        with pytest.raises(RuntimeError, match="_linear"):
             _linear(wrong, weights, 4, False)
-        with pytest.raises(RuntimeError, match="_blocks_"):
+        with pytest.raises(RuntimeError, match="_linear"):
             _norm(wrong, norm, 1e-5)
     for packed, columns in ((weights[1:], 4), (weights.double(), 4), (weights, 40), (weights, 0),
                             (weights, -4), (weights, 2**62)):  # fmt: skip
-        with pytest.raises(RuntimeError, match=r"_blocks_|too large"):
+        with pytest.raises(RuntimeError, match=r"_linear|too large"):
             _linear(x, packed, columns, False)
 
-    blocks = stage(depth=1)
-    table = blocks[0].attn.position_bias().contiguous()
-    parameters, windows, heads, mlp_dim, eps = packed_blocks(blocks)
-    assert (heads, mlp_dim, eps) == (3, 60, 1e-5)
-    given = dict(
-        x=torch.zeros(1, 8, 16, 24), parameters=parameters, tables=[table], windows=windows,
-        heads=heads, mlp_dim=mlp_dim, eps=eps,
-    )  # fmt: skip
-    torch.ops.darswin._blocks_(*given.values())
-    for change in (
-        dict(x=torch.zeros(1, 8, 16, 20)), dict(x=torch.zeros(8, 16, 24)),
-        dict(x=torch.zeros(1, 16, 8, 24).transpose(1, 2)), dict(x=torch.zeros(1, 8, 12, 24)),
-        dict(parameters=parameters[:5]), dict(tables=[]), dict(tables=[table[:, :2]]),
-        dict(windows=[4, 8, 0, 0, 0]), dict(windows=[4, 7, 0, 0, 0, 1]), dict(heads=0),
-        dict(windows=[4, 8, 0, 16, 0, 1]), dict(heads=5), dict(mlp_dim=2**61), dict(mlp_dim=59),
-        dict(mlp_dim=0),
-    ):  # fmt: skip
-        with pytest.raises(RuntimeError):
-            torch.ops.darswin._blocks_(*(given | change).values())
+
+def test_blocks_that_do_not_fit():
+    blocks = OwnBlocks(stage(depth=1))
+    table, x = torch.zeros(1, *blocks.table_shapes[0]), torch.zeros(1, *blocks.map_shape)
+    blocks(x, [table])
+    words, weights = blocks.words, blocks.weights.words
+    assert words[-25] == BLOCK and (blocks.heads, blocks.mlp_dim) == (3, 60)
+    wrong = {1: (9, 0), 2: (0,), 3: (20,), 4: (0, -3, 5), 5: (0, 2**61), 6: (-1, 2**40),
+             7: (-1, weights.numel()), 8: (2,), 16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,),
+             22: (0, 2)}  # fmt: skip
+    for place, values in wrong.items():
+        for value in values:
+            changed = [*words]
+            changed[place - 23] = value
+            with pytest.raises(ValueError, match="the program of a network"):
+                RUN([x, table], weights, changed)
+    for given in ([x], [x[..., :20], table], [x, table[:, :2]], [x.transpose(1, 2)[:, :1], table]):
+        with pytest.raises(RuntimeError, match="_run"):
+            RUN(given, weights, words)

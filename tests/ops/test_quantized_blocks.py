@@ -1,5 +1,6 @@
 """The operators of optimized models with 8-bit weights and tokens."""
 
+import itertools
 import math
 
 import pytest
@@ -9,14 +10,22 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from test_blocks import every_stage, stage
 
-from darswin.deploy.packed import OneDNN, Own, norm_parameters, packed_weights
+from darswin.deploy.own import norm_parameters, packed_weights
+from darswin.deploy.packed import OneDNN, Own
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize, with_quantized_layers
 from darswin.ops import _module, cpu_capability
 
 OPS = torch.ops.darswin
-HAS_KERNEL = cpu_capability() == "avx512" and torch.cpu._is_vnni_supported()
-needs_kernel = pytest.mark.skipif(not HAS_KERNEL, reason="this tier or CPU has no VNNI")
+
+
+@pytest.fixture(autouse=True, scope="module", params=[True, False], ids=["fours", "pairs"])
+def fours(request):
+    """With the CPU's products of four bytes, if it has them, and without."""
+    if not _module.allow_fours(request.param) and request.param:
+        pytest.skip("this tier or CPU has no products of four bytes")
+    yield
+    _module.allow_fours(True)
 
 
 def layer(depth, columns, activation=(1.0, 0), *, bias=True, weight=None):
@@ -32,7 +41,6 @@ def tokens(*shape, value=None):
     return torch.randint(lowest, highest + 1, shape, dtype=torch.uint8)
 
 
-@needs_kernel
 @given(
     st.integers(0, 20), st.integers(1, 75), st.integers(1, 120), st.sampled_from([0, 1, 119, 255]),
     st.sampled_from([None, -128, 127]), st.sampled_from([None, 0, 255]), st.integers(0, 2**31),
@@ -51,7 +59,6 @@ def test_sums_are_exact(rows, depth, columns, zero_point, weight, value, seed):
     assert sums.dtype == torch.int32 and torch.equal(got, sums.float())
 
 
-@needs_kernel
 @pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="oneDNN has no products of 8 bits")
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize("size", [(1, 1, 1), (33, 130, 50), (64, 96, 288), (20, 1536, 384)])
@@ -66,7 +73,6 @@ def test_bits_are_those_of_onednn(size, bias):
     assert torch.equal(got, OneDNN(torch.float32).linear(linear)(q))
 
 
-@needs_kernel
 def test_merging():
     linear, x = layer(37, 50, (0.03, 100), bias=False), torch.randn(3, 9, 37)
     norm = torch.nn.LayerNorm(37).requires_grad_(False)
@@ -109,7 +115,6 @@ def step_by_step(blocks, tables, x):
     return x
 
 
-@needs_kernel
 @pytest.mark.parametrize("batch", [0, 1, 3])
 @pytest.mark.parametrize("names", [LAYERS, LAYERS[:1], LAYERS[1:2], LAYERS[2:], ("mlp.fc2",)])
 @every_stage
@@ -120,7 +125,6 @@ def test_blocks_are_those_of_the_layers(batch, names, sizes):
     assert torch.equal(got, step_by_step(blocks, tables, x) if batch else x)
 
 
-@needs_kernel
 def test_same_bits_on_any_number_of_threads():
     blocks, tables = quantized_stage(dim=48, map_size=(16, 32))
     packed, x = Own().blocks(blocks), torch.randn(4, 16, 32, 48)
@@ -134,7 +138,6 @@ def test_same_bits_on_any_number_of_threads():
     )  # fmt: skip
 
 
-@needs_kernel
 def test_numbers_that_are_not_finite_stay_in_their_windows():
     blocks, tables = quantized_stage(depth=1)
     x = torch.randn(1, 8, 16, 24)
@@ -144,7 +147,6 @@ def test_numbers_that_are_not_finite_stay_in_their_windows():
     assert torch.equal(got[:, 4:], clean[:, 4:]) and torch.equal(got[:, :, 8:], clean[:, :, 8:])
 
 
-@needs_kernel
 def test_wrong_arguments():
     weights, q = packed_weights(layer(6, 4)), tokens(3, 6)
     for x, packed, columns in (
@@ -152,17 +154,39 @@ def test_wrong_arguments():
         (q, weights.view(torch.float32), 4), (q[:, :1], weights, 4), (q, weights.long(), 4),
         (tokens(1, 2**16 + 1), packed_weights(layer(2**16 + 1, 1)), 1),
     ):  # fmt: skip
-        with pytest.raises(RuntimeError, match="_blocks_"):
+        with pytest.raises(RuntimeError, match="_linear"):
             OPS._linear(x, packed, columns, False)
 
 
-def test_tiers_without_a_kernel():
-    before, weights = cpu_capability(), packed_weights(layer(6, 4))
+EXTREMES = [(255, 127), (255, -127), (255, -128), (0, -128), (None, None)]
+
+
+@pytest.mark.parametrize("zero_point", [0, 119, 255])
+@pytest.mark.parametrize("depth", [1, 2, 3, 4, 5, 37, 256, 259, 1030])
+def test_every_tier_gives_the_same_bits(depth, zero_point):
+    before = cpu_capability()
     try:
-        for tier in _module.tiers():
-            _module.set_tier(tier)
-            if tier != "avx512" or not torch.cpu._is_vnni_supported():
-                with pytest.raises(RuntimeError, match="no products of 8 bits"):
-                    OPS._linear(tokens(3, 6), weights, 4, False)
+        for (value, weight), columns in itertools.product(EXTREMES, (1, 17, 50)):
+            linear = layer(depth, columns, (0.0317, zero_point), weight=weight)
+            linear.weight_scale, linear.bias = torch.rand(columns) / 100, torch.randn(columns)
+            q, packed = tokens(13, depth, value=value), packed_weights(linear)
+            sums = (q.int() - zero_point) @ linear.weight.int().t()
+            want = sums.float() * torch.tensor(0.0317) * linear.weight_scale + linear.bias
+            for tier in _module.tiers():
+                _module.set_tier(tier)
+                for rows in (1, 4, 13):
+                    assert torch.equal(OPS._linear(q[:rows], packed, columns, False), want[:rows])
     finally:
         _module.set_tier(before)
+
+
+def test_numbers_that_are_not_finite_count_as_zero():
+    linear, x = layer(37, 50, (0.03, 100)), torch.randn(9, 37)
+    linear.bias = torch.randn(50)
+    norm = torch.nn.LayerNorm(37).requires_grad_(False)
+    given = packed_weights(linear), 50, False, norm_parameters(norm), norm.eps
+    clean = OPS._linear(x, *given)
+    x[3, 2], x[7, 36] = math.nan, math.inf
+    got = OPS._linear(x, *given)
+    for row in range(9):
+        assert torch.equal(got[row], linear.bias if row in (3, 7) else clean[row])

@@ -12,6 +12,7 @@ namespace {
 constexpr int kRegister = 32;  // bytes
 constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
 constexpr bool kFused = true;
+constexpr bool kHasFours = true, kSignedFours = false;
 
 using Floats = Vector<float, 8>;
 using Doubles = Vector<double, 4>;
@@ -34,8 +35,27 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)(bits << 16);
 }
 
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 8> v) {
+  const __m256i first = _mm256_set1_epi32(0x0C080400);
+  const __m256i fours = _mm256_shuffle_epi8((__m256i)v, first);
+  const __m128i upper = _mm256_extracti128_si256(fours, 1);
+  store_bits(to, _mm_cvtsi128_si64(_mm_unpacklo_epi32(_mm256_castsi256_si128(fours), upper)));
+}
+
 inline Words lower_product(Words a, uint32_t b) {
   return (Words)_mm256_mul_epu32((__m256i)a, (__m256i)splat<Words>(static_cast<uint64_t>(b)));
+}
+
+inline Vector<int32_t, 8> add_pairs(Vector<int32_t, 8> sums, Vector<uint32_t, 8> x,
+                                    Vector<uint32_t, 8> weights) {
+  return sums + (Vector<int32_t, 8>)_mm256_madd_epi16((__m256i)x, (__m256i)weights);
+}
+
+// The instruction is AVX-VNNI. Assembly needs no flag of the compiler.
+inline Vector<int32_t, 8> add_fours(Vector<int32_t, 8> sums, Vector<uint32_t, 8> x,
+                                    Vector<uint32_t, 8> weights) {
+  asm("%{vex%} vpdpbusd %2, %1, %0" : "+x"(sums) : "x"(x), "x"(weights));
+  return sums;
 }
 
 }  // namespace

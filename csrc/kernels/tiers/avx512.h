@@ -13,6 +13,7 @@ namespace {
 constexpr int kRegister = 64;  // bytes
 constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
 constexpr bool kFused = true;
+constexpr bool kHasFours = true, kSignedFours = false;
 
 using Floats = Vector<float, 16>;
 using Doubles = Vector<double, 8>;
@@ -40,16 +41,24 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);
 }
 
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 16> v) {
+  store_bits(to, __builtin_convertvector(v, Vector<uint8_t, 16>));
+}
+
 inline Words lower_product(Words a, uint32_t b) {
   const Words factor = splat<Words>(static_cast<uint64_t>(b));
   return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
 }
 
-// Adds the products of four unsigned and four signed bytes to each sum. This instruction is part of
-// AVX-512 VNNI, which not all CPUs of this tier have. Assembly needs no flag of the compiler.
-inline Vector<int32_t, 16> add_product(Vector<int32_t, 16> sums, Vector<uint32_t, 16> unsigned4,
-                                       Vector<uint32_t, 16> signed4) {
-  asm("vpdpbusd %2, %1, %0" : "+v"(sums) : "v"(unsigned4), "v"(signed4));
+inline Vector<int32_t, 16> add_pairs(Vector<int32_t, 16> sums, Vector<uint32_t, 16> x,
+                                     Vector<uint32_t, 16> weights) {
+  return sums + (Vector<int32_t, 16>)_mm512_madd_epi16((__m512i)x, (__m512i)weights);
+}
+
+// The instruction is part of AVX-512 VNNI. Assembly needs no flag of the compiler.
+inline Vector<int32_t, 16> add_fours(Vector<int32_t, 16> sums, Vector<uint32_t, 16> x,
+                                     Vector<uint32_t, 16> weights) {
+  asm("vpdpbusd %2, %1, %0" : "+v"(sums) : "v"(x), "v"(weights));
   return sums;
 }
 

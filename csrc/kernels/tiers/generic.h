@@ -18,6 +18,8 @@ namespace {
 constexpr int kRegister = 16;  // bytes
 constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
 constexpr bool kFused = false;
+// There is add_fours, and it takes signed bytes: those of tokens less 128.
+constexpr bool kHasFours = false, kSignedFours = false;
 
 using Floats = Vector<float, 4>;
 using Doubles = Vector<double, 2>;
@@ -45,6 +47,14 @@ inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)(bits << 16);
 }
 
+// Stores the lowest byte of each lane.
+inline void store_lowest_bytes(uint8_t* to, Vector<uint32_t, 4> v) {
+  auto bytes = (Vector<uint8_t, 16>)v;
+  bytes = evens(bytes, bytes);
+  bytes = evens(bytes, bytes);
+  __builtin_memcpy(to, &bytes, 4);
+}
+
 // Returns the products of the lower halves of the lanes.
 inline Words lower_product(Words a, uint32_t b) {
   const Words factor = splat<Words>(static_cast<uint64_t>(b));
@@ -52,6 +62,19 @@ inline Words lower_product(Words a, uint32_t b) {
   return (Words)_mm_mul_epu32((__m128i)a, (__m128i)factor);
 #else
   return (a & 0xFFFFFFFF) * factor;
+#endif
+}
+
+// Adds the products of two signed numbers of 16 bits to each sum. Tiers with kHasFours also have
+// add_fours: the same for four bytes of a token and four signed bytes of the weights. Only some
+// CPUs of a tier have its instruction; core/dispatch.h tells which.
+inline Vector<int32_t, 4> add_pairs(Vector<int32_t, 4> sums, Vector<uint32_t, 4> x,
+                                    Vector<uint32_t, 4> weights) {
+#if defined(__SSE2__)
+  return sums + (Vector<int32_t, 4>)_mm_madd_epi16((__m128i)x, (__m128i)weights);
+#else
+  const auto a = (Vector<int32_t, 4>)x, b = (Vector<int32_t, 4>)weights;
+  return sums + (a << 16 >> 16) * (b << 16 >> 16) + (a >> 16) * (b >> 16);
 #endif
 }
 

@@ -1,22 +1,18 @@
-// _pack_linear, _norm, _linear and _blocks_ on CPU: the layers and the transformer blocks of
-// optimized models.
-//
-// For a small block, the Python calls take longer than its arithmetic. So all blocks of a stage are
-// one operator, which calls kernel after kernel.
+// _pack_linear, _norm and _linear on CPU: single layers of optimized models. run.cpp runs whole
+// networks.
 #include <algorithm>
 #include <bit>
-#include <cmath>
 #include <cstring>
 #include <numeric>
 #include <vector>
 
+#include "checks.h"
 #include "core/layers.h"
-#include "window_attention_call.h"
 
 namespace darswin {
 namespace {
 
-constexpr char kName[] = "_blocks_";
+constexpr char kName[] = "_linear";
 
 void check_parameter(const Tensor& tensor, ScalarType type, int64_t count) {
   STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type && tensor.is_contiguous() &&
@@ -88,8 +84,6 @@ Tensor pack_linear(Tensor weight, MaybeTensor bias, MaybeTensor weight_scale, do
 // Returns a packed layer of this depth and these columns.
 Layer checked_layer(const Tensor& packed, int64_t depth, int64_t columns) {
   const bool is_quantized = packed.scalar_type() == ScalarType::Int;
-  STD_TORCH_CHECK(!is_quantized || has_quantized_layers(), kName,
-                  ": this tier or this CPU has no products of 8 bits");
   STD_TORCH_CHECK(!is_quantized || depth <= kMostDepth, kName,
                   ": sums of so many products do not fit 32 bits");
   check_parameter(packed, is_quantized ? ScalarType::Int : ScalarType::Float,
@@ -145,43 +139,6 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor n
   return out;
 }
 
-void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> tables, Sizes windows,
-             int64_t heads, int64_t mlp_dim, double eps) {
-  const size_t count = tables.size();
-  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() == 4 &&
-                      x.is_contiguous() && heads > 0 && x.size(3) > 0 && x.size(3) % heads == 0 &&
-                      mlp_dim > 0 && parameters.size() == 6 * count && windows.size() == 6 * count,
-                  kName, ": wrong arguments");
-  if (x.numel() == 0) return;
-  check_product({x.size(3), mlp_dim});
-  check_product({x.numel() / x.size(3), mlp_dim});
-  const int64_t dim = x.size(3), tokens = x.numel() / dim;
-  Tensor scratch = new_tensor(Sizes{0}, ScalarType::Byte);
-  const Tensor none =
-      new_tensor(Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads}, ScalarType::Float);
-  for (size_t k = 0; k < count; ++k) {
-    const Tensor* p = &parameters[6 * k];
-    const int64_t* w = &windows[6 * k];
-    // Without numbers: it checks the table, and finds the windows.
-    const auto pair = [&](int at) { return Sizes(w + at, w + at + 2); };
-    const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
-    const int64_t table_rows = tables[k].size(0);
-    AttentionCall<float> call(none, tables[k], pair(0), pair(2), pair(4), scale);
-    call.args.windows /= x.size(0);
-    const Block block{.norm1 = checked_norm(p[0], dim, eps),
-                      .norm2 = checked_norm(p[3], dim, eps),
-                      .qkv = checked_layer(p[1], dim, 3 * dim),
-                      .proj = checked_layer(p[2], dim, dim),
-                      .fc1 = checked_layer(p[4], dim, mlp_dim),
-                      .fc2 = checked_layer(p[5], mlp_dim, dim),
-                      .windows = call.args};
-    const int64_t bytes = block.scratch(tokens);
-    if (scratch.numel() < bytes) scratch = new_tensor(Sizes{bytes}, ScalarType::Byte);
-    block.run(mutable_pointer<float>(x), x.size(0), pointer<float>(call.bias), table_rows,
-              scratch.mutable_data_ptr());
-  }
-}
-
 }  // namespace
 }  // namespace darswin
 
@@ -189,5 +146,4 @@ STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
   m.impl("_pack_linear", TORCH_BOX(&darswin::pack_linear));
   m.impl("_norm", TORCH_BOX(&darswin::norm));
   m.impl("_linear", TORCH_BOX(&darswin::linear));
-  m.impl("_blocks_", TORCH_BOX(&darswin::blocks_));
 }

@@ -1,0 +1,145 @@
+// libdarswin_frames.so: the C functions of darswin_frames.h.
+#include <darswin_frames.h>
+
+#include <exception>
+#include <stdexcept>
+#include <string>
+#include <system_error>
+
+#include "../core/network_file.h"
+#include "../core/parallel.h"
+
+#define DARSWIN_API extern "C" __attribute__((visibility("default")))
+
+struct darswin_network : darswin::FrameNetwork {
+  using FrameNetwork::FrameNetwork;
+};
+
+namespace {
+
+thread_local std::string last_error;
+
+// The result of `body`, or `failed` if it throws.
+template <typename Body, typename Result>
+Result caught(Body body, Result failed) noexcept {
+  try {
+    return body();
+  } catch (const std::exception& error) {
+    try {
+      last_error = error.what();
+    } catch (...) {
+      last_error.clear();
+    }
+  } catch (...) {
+    last_error.clear();
+  }
+  return failed;
+}
+
+void require(bool condition, const char* what) {
+  if (!condition) throw std::invalid_argument(what);
+}
+
+void check_output(const darswin_network* network, int64_t k) {
+  require(network != nullptr && k >= 0 && k < network->output_count(),
+          "there is no such network or output");
+}
+
+}  // namespace
+
+DARSWIN_API const char* darswin_version() { return DARSWIN_VERSION; }
+
+DARSWIN_API const char* darswin_file_version() {
+  static const std::string text =
+      std::to_string(darswin::kFileVersion[0]) + "." + std::to_string(darswin::kFileVersion[1]);
+  return text.c_str();
+}
+
+DARSWIN_API const char* darswin_last_error() { return last_error.c_str(); }
+
+DARSWIN_API darswin_network* darswin_load(const char* path) {
+  return caught(
+      [&] {
+        require(path != nullptr, "path must not be NULL");
+        try {
+          return new darswin_network(path);
+        } catch (const std::system_error& error) {
+          throw std::runtime_error(std::string(path) + ": " + error.code().message());
+        }
+      },
+      static_cast<darswin_network*>(nullptr));
+}
+
+DARSWIN_API void darswin_free(darswin_network* network) { delete network; }
+
+DARSWIN_API void darswin_frame_size(const darswin_network* network, int64_t size[3]) {
+  size[0] = network->height(), size[1] = network->width(), size[2] = network->channels();
+}
+
+DARSWIN_API int64_t darswin_output_count(const darswin_network* network) {
+  return network->output_count();
+}
+
+DARSWIN_API const int64_t* darswin_output_shape(const darswin_network* network, int64_t output) {
+  return caught(
+      [&] {
+        check_output(network, output);
+        return network->output_shape(output).data();
+      },
+      static_cast<const int64_t*>(nullptr));
+}
+
+DARSWIN_API int64_t darswin_output_axes(const darswin_network* network, int64_t output) {
+  return caught(
+      [&] {
+        check_output(network, output);
+        return static_cast<int64_t>(network->output_shape(output).size());
+      },
+      int64_t{-1});
+}
+
+DARSWIN_API int64_t darswin_output_numbers(const darswin_network* network, int64_t output) {
+  return caught(
+      [&] {
+        check_output(network, output);
+        int64_t numbers = 1;
+        for (const int64_t size : network->output_shape(output)) numbers *= size;
+        return numbers;
+      },
+      int64_t{-1});
+}
+
+DARSWIN_API int64_t darswin_label_count(const darswin_network* network) {
+  return static_cast<int64_t>(network->labels().size());
+}
+
+DARSWIN_API const char* darswin_label(const darswin_network* network, int64_t label) {
+  return caught(
+      [&] {
+        require(label >= 0 && label < darswin_label_count(network), "there is no such label");
+        return network->labels()[label].c_str();
+      },
+      static_cast<const char*>(nullptr));
+}
+
+DARSWIN_API int darswin_run(const darswin_network* network, const darswin_frame* frame,
+                            float* const* outputs, int64_t threads) {
+  return caught(
+      [&] {
+        require(network != nullptr && frame != nullptr && frame->pixels != nullptr &&
+                    outputs != nullptr,
+                "network, frame, its pixels and outputs must not be NULL");
+        require(threads >= 1, "threads must be at least 1");
+        for (int64_t k = 0; k < network->output_count(); ++k) {
+          require(outputs[k] != nullptr, "outputs must not be NULL");
+        }
+        const darswin::Frame pixels{frame->pixels,        frame->height,     frame->width,
+                                    frame->channels,      frame->row_stride, frame->column_stride,
+                                    frame->channel_stride};
+        network->check(pixels);
+        const darswin::ThreadLimit limit(threads);
+        network->run(pixels, outputs);
+        return 0;
+      },
+      -1);
+}

@@ -1,0 +1,238 @@
+// Checks a program, once for all its runs.
+#include "network.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include "../polar_to_image.h"
+
+namespace darswin {
+namespace {
+
+constexpr int64_t kMost = int64_t{1} << 40;  // of any number in a program
+// The count of arguments of each opcode, in its order.
+constexpr std::array<int64_t, 12> kArguments = {9, 5, 23, 19, 2, 4, 1, 8, 7, 8, 8, 2};
+void require(bool condition, const char* what) {
+  if (!condition) throw std::invalid_argument(std::string("the program of a network ") + what);
+}
+
+// The product of sizes, each at least 0. Throws if it is too large.
+int64_t product(std::initializer_list<int64_t> sizes) {
+  int64_t result = 1;
+  for (const int64_t size : sizes) {
+    require(size >= 0 && size <= kMost, "has a size out of range");
+    require(!__builtin_mul_overflow(result, size, &result) && result <= kMost,
+            "has sizes that are too large");
+  }
+  return result;
+}
+
+// Reads a program from front to back.
+struct Reader {
+  const std::vector<int64_t>& program;
+  size_t at = 0;
+
+  int64_t next() {
+    require(at < program.size(), "ends too early");
+    return program[at++];
+  }
+  int64_t size() {
+    const int64_t value = next();
+    require(value >= 0 && value <= kMost, "has a size out of range");
+    return value;
+  }
+  std::vector<int64_t> sizes() {
+    const int64_t count = next();
+    require(count >= 0 && count <= static_cast<int64_t>(program.size() - at), "ends too early");
+    std::vector<int64_t> values(count);
+    for (int64_t& value : values) value = size();
+    return values;
+  }
+};
+
+}  // namespace
+
+Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_t words_)
+    : program(std::move(program_)), weights(weights_), words(words_) {
+  Reader reader{program};
+  inputs = reader.sizes();
+  buffers = reader.sizes();
+  const int64_t count = reader.size();
+  for (int64_t k = 0; k < count; ++k) {
+    const int64_t buffer = reader.size();
+    std::vector<int64_t> shape = reader.sizes();
+    require(buffer < static_cast<int64_t>(buffers.size()), "has an output without a buffer");
+    int64_t numbers = 1;
+    for (const int64_t size : shape) numbers = product({numbers, size});
+    require(numbers == buffers[buffer], "has an output of another size than its buffer");
+    for (const Output& other : outputs) {
+      require(other.slot != input_count() + buffer, "has two outputs in one buffer");
+    }
+    outputs.push_back({input_count() + buffer, std::move(shape)});
+  }
+  while (reader.at < program.size()) {
+    const int64_t opcode = reader.next(), arguments = reader.size();
+    require(opcode >= 0 && opcode < static_cast<int64_t>(kArguments.size()) &&
+                arguments == kArguments[opcode] &&
+                arguments <= static_cast<int64_t>(program.size() - reader.at),
+            "has an unknown instruction: it may come from a newer version of darswin");
+    steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at], arguments));
+    reader.at += arguments;
+  }
+}
+
+// Throws unless a slot exists, has room for these numbers, and is a buffer if it is written.
+void Network::fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const {
+  const int64_t first = input_count();
+  require(slot >= (writes ? first : 0) && slot < first + static_cast<int64_t>(buffers.size()),
+          "names a slot that it does not have");
+  require(product(sizes) == (slot < first ? inputs[slot] : buffers[slot - first]),
+          "uses a slot of another size");
+}
+
+Layer Network::layer_at(int64_t offset, int64_t depth, int64_t columns,
+                        int64_t is_quantized) const {
+  require(depth > 0 && columns > 0 && (is_quantized == 0 || is_quantized == 1),
+          "has an empty layer");
+  product({depth + kPanelUnit, columns + kPanelUnit, 4});
+  require(is_quantized == 0 || depth <= kMostDepth, "has a sum that does not fit 32 bits");
+  const int64_t count = Layer::words(depth, columns, is_quantized == 1);
+  require(offset >= 0 && offset <= words && count <= words - offset, "reads beyond its weights");
+  return Layer(weights + offset, depth, columns, is_quantized == 1);
+}
+
+// The parameters of a norm are its weight and its bias, then its eps.
+Norm Network::norm_at(int64_t offset, int64_t dim) const {
+  const int64_t count = product({dim, 2}) + 1;
+  require(dim > 0 && offset >= 0 && offset <= words && count <= words - offset,
+          "reads beyond its weights");
+  const auto* parameters = reinterpret_cast<const float*>(weights) + offset;
+  return {parameters, dim, parameters[2 * dim]};
+}
+
+Block Network::block_of(const int64_t* a) const {
+  const int64_t rings = a[1], sectors = a[2], dim = a[3], heads = a[4], mlp = a[5];
+  fits(a[0], {rings, sectors, dim}, true);
+  require(heads > 0 && dim > 0 && dim % heads == 0 && mlp > 0, "has a block of wrong sizes");
+  product({rings, sectors, std::max(3 * dim, mlp)});
+  const int64_t* w = a + 16;  // window, shift, periodic
+  for (int axis = 0; axis < 2; ++axis) {
+    const int64_t size = a[1 + axis];
+    require(
+        w[axis] > 0 && size > 0 && size % w[axis] == 0 && w[2 + axis] >= 0 && w[2 + axis] < size,
+        "has windows that do not fit their map");
+  }
+  require(a[22] < input_count(), "has a table that is no input");
+  fits(a[22], {heads, 2 * w[0] - 1, 2 * w[1] - 1}, false);
+  Block block{.norm1 = norm_at(a[6], dim),
+              .norm2 = norm_at(a[11], dim),
+              .qkv = layer_at(a[7], dim, 3 * dim, a[8]),
+              .proj = layer_at(a[9], dim, dim, a[10]),
+              .fc1 = layer_at(a[12], dim, mlp, a[13]),
+              .fc2 = layer_at(a[14], mlp, dim, a[15])};
+  auto& windows = block.windows;
+  windows.rings = rings, windows.sectors = sectors;
+  windows.heads = heads, windows.head_dim = dim / heads;
+  windows.window_r = w[0], windows.window_a = w[1];
+  windows.windows = (rings / w[0]) * (sectors / w[1]);
+  windows.shift_r = w[2], windows.shift_a = w[3];
+  windows.periodic_r = w[4] != 0, windows.periodic_a = w[5] != 0;
+  windows.scale = static_cast<float>(1 / std::sqrt(static_cast<double>(dim / heads)));
+  return block;
+}
+
+Network::Step Network::checked(Opcode opcode, const int64_t* a, int64_t) const {
+  Step step{opcode, a};
+  const auto apart = [&] { require(a[0] != a[1], "writes what it still reads"); };
+  switch (opcode) {
+    case Opcode::linear:
+      apart();
+      fits(a[0], {a[2], a[3]}, false);
+      fits(a[1], {a[2], a[4]}, true);
+      step.layer = layer_at(a[5], a[3], a[4], a[6]);
+      require(a[6] == 0 || a[7] >= 0, "has a quantized layer without a norm");
+      if (a[7] >= 0) step.norm = norm_at(a[7], a[3]);
+      break;
+    case Opcode::norm:
+      fits(a[0], {a[2], a[3]}, false);
+      fits(a[1], {a[2], a[3]}, true);
+      step.norm = norm_at(a[4], a[3]);
+      break;
+    case Opcode::block:
+      step.block = block_of(a);
+      break;
+    case Opcode::copy: {
+      apart();
+      const int64_t slots[] = {a[0], a[1]};
+      for (int side = 0; side < 2; ++side) {
+        const int64_t slot = slots[side], first = input_count();
+        require(
+            slot >= (side == 0 ? 0 : first) && slot < first + static_cast<int64_t>(buffers.size()),
+            "names a slot that it does not have");
+        const int64_t* sizes = a + 4;
+        int64_t last = a[2 + side];
+        product({last});
+        for (int axis = 0; axis < kCopyAxes; ++axis) {
+          require(sizes[axis] > 0, "copies nothing");
+          last += product({sizes[axis] - 1, sizes[kCopyAxes * (1 + side) + axis]});
+          product({last});
+        }
+        const int64_t numbers = slot < first ? inputs[slot] : buffers[slot - first];
+        require(last < numbers, "copies beyond a slot");
+        require(side == 0 || product({a[4], a[5], a[6], a[7], a[8]}) <= numbers,
+                "copies to a place twice");
+      }
+      break;
+    }
+    case Opcode::add: {
+      apart();
+      const int64_t first = input_count(), to = a[1] - first;
+      require(to >= 0 && to < static_cast<int64_t>(buffers.size()),
+              "names a slot that it does not have");
+      fits(a[0], {buffers[to]}, false);
+      break;
+    }
+    case Opcode::mean:
+      apart();
+      require(a[2] > 0, "has a mean of nothing");
+      fits(a[0], {a[2], a[3]}, false);
+      fits(a[1], {a[3]}, true);
+      break;
+    case Opcode::gelu:
+    case Opcode::distance:
+      require(a[0] >= input_count() && a[0] < input_count() + static_cast<int64_t>(buffers.size()),
+              "names a slot that it does not have");
+      break;
+    case Opcode::conv:
+      apart();
+      fits(a[0], {a[2], a[3], a[4]}, false);
+      fits(a[1], {a[2], a[3], a[5]}, true);
+      step.layer = layer_at(a[6], product({a[4], 9}), a[5], 0);
+      require(a[7] >= 0 && a[7] <= static_cast<int64_t>(After::add), "has an unknown step");
+      break;
+    case Opcode::resize:
+    case Opcode::sample:
+      apart();
+      fits(a[0], {a[2], a[3], a[6]}, false);
+      fits(a[1], {a[4], a[5], a[6]}, true);
+      require(product({a[2], a[3]}) > 0, "samples an empty map");
+      if (opcode == Opcode::sample) fits(a[7], {a[4], a[5], 2}, false);
+      break;
+    case Opcode::to_image:
+      apart();
+      fits(a[0], {a[2], a[3], a[4]}, false);
+      fits(a[1], {a[5], a[6], a[4]}, true);
+      fits(a[7], {a[5], kPosition, a[6]}, false);
+      require(a[7] < input_count(), "has a plan that is no input");
+      require(a[2] > 0 && a[3] > 0 && a[2] <= (1 << 24) && product({a[2], a[3]}) <= INT32_MAX,
+              "has too many tokens");
+      break;
+  }
+  return step;
+}
+
+}  // namespace darswin

@@ -1,0 +1,111 @@
+"""Layers by our own operators. They are plain callables: a module would take a microsecond more for
+each call."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+import darswin.ops  # noqa: F401  (it registers our operators)
+from darswin.layers.quantized import Quantization, quantized_layers
+from darswin.ops import _module
+
+_CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
+
+
+def own_operator(name: str) -> Callable[..., Any]:
+    """One of our operators for the CPU. Without the compiled module, it refuses calls."""
+    if _module.LACK is not None:
+        return partial(_module.require, name)
+    # Not by way of autograd, which would look for gradients and count versions: there are none.
+    return partial(getattr(torch.ops.darswin, name).default.redispatch, _CPU)
+
+
+_NORM = own_operator("_norm")
+_PACK = own_operator("_pack_linear")
+_LINEAR = own_operator("_linear")
+
+
+def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
+    """The quantization of what the layer with this name takes; None if it is not quantized."""
+    return quantized_layers(module).get(name)
+
+
+def packed_weights(linear: Any) -> Tensor:
+    """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
+    weight = linear.weight.detach()
+    bias = None if linear.bias is None else linear.bias.detach().float()
+    if (taken := taken_by(linear)) is not None:
+        return _PACK(weight, bias, linear.weight_scale.float(), *taken)
+    return _PACK(weight.float(), bias)
+
+
+def norm_parameters(norm: nn.LayerNorm) -> Tensor:
+    """The weight and the bias of a norm, (2, D) float32."""
+    return torch.stack((norm.weight, norm.bias)).detach().float()
+
+
+def pack(weight: Tensor, bias: Tensor | None) -> Tensor:
+    """A weight (D', D) and a bias as `_linear` reads them, (K,) float32."""
+    return _PACK(weight.detach().float(), None if bias is None else bias.detach().float())
+
+
+class OwnLinear:
+    """A linear layer by our own operators, behind a norm or before a GELU if asked."""
+
+    def __init__(
+        self, packed: Tensor, columns: int, *, gelu: bool = False, norm: "OwnNorm | None" = None
+    ):
+        self.packed, self.columns, self.gelu, self.norm = packed, columns, gelu, norm
+        self._given: tuple = (packed, columns, gelu)
+        if norm is not None:
+            self._given = (*self._given, norm.parameters, norm.eps)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return _LINEAR(x, *self._given)
+
+
+class OwnNorm:
+    """A layer norm by our own operators."""
+
+    def __init__(self, norm: nn.LayerNorm):
+        self.eps = norm.eps
+        eps = torch.tensor([norm.eps])
+        # As the programs of networks have it: the weight, the bias and eps.
+        self.words = torch.cat((norm_parameters(norm).flatten(), eps))
+        self.parameters = norm_parameters(norm)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return _NORM(x, self.parameters, self.eps)
+
+
+class PackedBlocks:
+    """The blocks of a stage, packed. All of them have window attention."""
+
+    def __init__(self, blocks: Sequence[Any]):
+        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
+        self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
+            (
+                OwnNorm(block.norm1),
+                packed_weights(block.attn.qkv),
+                packed_weights(block.attn.proj),
+                OwnNorm(block.norm2),
+                packed_weights(block.mlp.fc1),
+                packed_weights(block.mlp.fc2),
+            )
+            for block in blocks
+        ]
+        # Of each block: the window, the shift, and whether an axis is periodic.
+        self.windows: list[list[int]] = [
+            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
+        ]
+        attn = blocks[0].attn
+        self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
+        self.map_shape = (*attn.map_size, attn.dim)
+
+    @property
+    def table_shapes(self) -> list[tuple[int, int, int]]:
+        """The shape of the position bias of each block."""
+        return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]

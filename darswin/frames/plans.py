@@ -1,0 +1,360 @@
+"""Plans: where the frames of one camera are read, and the sampler that reads them there."""
+
+import hashlib
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from darswin.frames.compiled import frames
+from darswin.utils.files import replace_file
+from darswin.utils.tables import read_table
+
+if TYPE_CHECKING:
+    import torch
+
+    from darswin.frames.reading import Reading
+    from darswin.lens import Lens
+    from darswin.views import PolarGrid
+
+Output = Literal["tokens", "image", "uint8"]
+_VERSION = 3
+_LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
+_OUTSIDE = -3  # the column and row of a point outside of the frame
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The places at which the frames of one camera are read, and the form of the result.
+
+    Plans are equal if all of their attributes are.
+
+    Attributes:
+        columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
+            lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, (H', W') for an
+            image, and (n, H', W') for n tiles; a polar image has H' = R·S_r and W' = A·S_φ. If
+            `reads` is above 1, there is a last axis of the points of a pixel, row by row.
+        right, lower: the distances of each point from the centre of that pixel, in [0, 1], float32.
+        size: (H, W) of the frames.
+        output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W') or (n, C, H',
+            W'), and "uint8" is (H', W', C) or (n, H', W', C), as OpenCV has it.
+        mean, std: normalization `(pixel/255 - mean) / std`, one number for each channel, or one for
+            all; "uint8" is not normalized.
+        reads: the points along each side of a pixel, which is their mean. An image only.
+
+    Raises:
+        ValueError: mean and std are not 1 or 3 finite numbers each, or a std is not above 0.
+    """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    right: np.ndarray
+    lower: np.ndarray
+    size: tuple[int, int]
+    output: Output
+    mean: tuple[float, ...] = (0.0,)
+    std: tuple[float, ...] = (1.0,)
+    reads: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("mean", -math.inf), ("std", 0.0)):
+            values = tuple(map(float, getattr(self, name)))
+            if len(values) not in (1, 3):
+                raise ValueError(f"a plan needs 1 {name}, or 3 for RGB, got {len(values)}")
+            if not all(least < value < math.inf for value in values):
+                above = " and above 0" * (least == 0)
+                raise ValueError(f"{name} of a plan must be finite{above}, got {values}")
+            object.__setattr__(self, name, values)
+        if len(self.mean) != len(self.std):
+            raise ValueError(f"a plan needs as many means as stds, got {self.mean} and {self.std}")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Plan):
+            return NotImplemented
+        others = other.parts()
+        return all(np.array_equal(value, others[name]) for name, value in self.parts().items())
+
+    def parts(self) -> dict[str, Any]:
+        """The attributes by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __hash__(self) -> int:
+        return hash((self.size, self.output, self.mean, self.std, self.columns.shape))
+
+    def points(self, points: np.ndarray, tile: int = 0) -> np.ndarray:
+        """Carries pixels of the image to pixels of the frame, as a map for `darswin.boxes`.
+
+        Args:
+            points: (..., 2), x and y; pixel centres are integers.
+            tile: the number of the tile, if the plan has tiles.
+
+        Returns:
+            (..., 2) float64, NaN where nothing is seen. Places between pixels are read bilinearly.
+            For pictures of at least 256 pixels along rays, such as tiles, this differs from the
+            lens by a few thousandths of a pixel; for small ones and squares, by more.
+
+        Raises:
+            ValueError: the points have another shape, or the plan has tokens, which have no pixels.
+            IndexError: there is no such tile.
+        """
+        return read_table(self._tables[tile], (np.asarray(points) + 0.5) * self.reads - 0.5)
+
+    @cached_property
+    def _tables(self) -> np.ndarray:
+        """The places of the points, (n, reads·H', reads·W', 2), NaN outside of the frame."""
+        if self.output == "tokens":
+            raise ValueError("a plan of tokens has no pixels that could be carried to the frame")
+        places = np.stack((self.columns + self.right, self.rows + self.lower), -1)
+        places[self.columns == _OUTSIDE] = np.nan
+        height, width = self.columns.shape[-2 - (self.reads > 1) :][:2]
+        places = places.reshape(-1, height, width, self.reads, self.reads, 2)
+        return places.swapaxes(2, 3).reshape(-1, height * self.reads, width * self.reads, 2)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
+
+        Raises:
+            ValueError: the name has another ending.
+            OSError: the file cannot be written.
+        """
+        content = dict(self.parts(), darswin_plan=_VERSION)
+        write_arrays(path, content | dict(digest=_digest(content)))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> "Plan":
+        """Reads a plan from a file.
+
+        Files of versions 1 and 2 are read too. Some of version 1 normalize before they interpolate;
+        the samples of such a plan now differ from those of its time by rounding.
+
+        Raises:
+            ValueError: the file is no plan, is damaged, or comes from a newer version of darswin.
+            OSError: the file cannot be read.
+        """
+        name = os.fspath(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                damaged = file.zip.testzip()
+                content = dict(file)
+            version = int(content["darswin_plan"])
+        except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+            if isinstance(error, OSError) and error.filename is not None:
+                raise  # the file cannot be read
+            raise ValueError(f"{name} is no plan of darswin.frames, or it is damaged") from error
+        if version > _VERSION:
+            raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
+        try:
+            digest = content.pop("digest", None)  # older files have none
+            if damaged or (digest is not None and digest.item() != _digest(content)):
+                raise ValueError("other values than those that were written")
+            height, width = content["size"].tolist()
+            return cls(
+                columns=content["columns"],
+                rows=content["rows"],
+                right=content["right"],
+                lower=content["lower"],
+                size=(height, width),
+                output=content["output"].item(),
+                mean=tuple(content["mean"].tolist()),
+                std=tuple(content["std"].tolist()),
+                reads=content["reads"].item() if version > 2 else 1,
+            )
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
+
+
+def check_name(path: str | os.PathLike) -> None:
+    """ValueError unless the name of a file of arrays ends in ".npz"."""
+    if Path(path).suffix != ".npz":
+        raise ValueError(f"the name of the file must end in .npz, got {os.fspath(path)!r}")
+
+
+def write_arrays(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
+    """Writes arrays, in C order and not compressed, completely or not at all."""
+    check_name(path)
+    buffer = BytesIO()
+    arrays = {name: np.asarray(value, order="C") for name, value in content.items()}
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    replace_file(path, buffer.getbuffer())
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """The SHA-256 of arrays and their names."""
+    total = hashlib.sha256()
+    for name in sorted(content):
+        array = np.asarray(content[name])
+        total.update(f"{name} {array.dtype.str} {array.shape} ".encode() + array.tobytes())
+    return total.hexdigest()
+
+
+class Sampler:
+    """Samples frames at the places of a plan: `sampler(frame, out=None, threads=1)`.
+
+    A call takes a frame of uint8, (H, W, 3) or (H, W), in any memory layout, so that
+    `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It
+    runs without Python's lock, and several threads may call one sampler.
+
+    `out` is an array for the result: C-contiguous, with its shape and type, and in other memory
+    than the frame. `threads` is the most threads to use; small plans use fewer. The tokens and the
+    polar image are those of `darswin.ops.polar_sample`, bit for bit.
+
+    Args:
+        plan: a `Plan`, or its file.
+
+    Raises:
+        TypeError: in a call, the frame is no array of uint8.
+        ValueError: the plan is damaged; in a call, the frame or `out` does not fit the plan, or
+            they share memory.
+        OSError: the file cannot be read.
+    """
+
+    def __init__(self, plan: Plan | str | os.PathLike):
+        if not isinstance(plan, Plan):
+            plan = Plan.load(plan)
+        try:
+            self._sample = frames.sampler(
+                plan.columns, plan.rows, plan.right, plan.lower, plan.size,
+                [1 / (255 * std) for std in plan.std],
+                [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
+                plan.output, plan.reads,
+            )  # fmt: skip
+        except TypeError as error:
+            raise ValueError("the parts of the plan do not fit together") from error
+        self.plan = plan
+
+    def __call__(
+        self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
+    ) -> np.ndarray:
+        return self._sample(frame, out, threads)
+
+
+def plan(
+    sample: "torch.nn.Module",
+    lens: "Lens",
+    size: tuple[int, int],
+    *,
+    output: Output | None = None,
+    mean: float | Sequence[float] | None = None,
+    std: float | Sequence[float] | None = None,
+) -> Plan:
+    """Finds the places at which a network or a view reads the frames of a camera. Needs torch.
+
+    Args:
+        sample: a model, which reads a polar grid or a view of its own, or a view of
+            `darswin.views`. All tiles of a view are in one plan.
+        lens: the lens of the camera.
+        size: (H, W) of the frames.
+        output: the form of the result, see `Plan`. By default it is the input of the network,
+            "tokens" or "image". Only a polar grid has tokens.
+        mean, std: the normalization of the frames, a number for all channels or one for each; by
+            default the view's.
+
+    Raises:
+        TypeError: `sample` is none of these, or the size is not whole.
+        ValueError: there is more than one lens, the lens belongs to another size, the model takes
+            the images as they are, a side is longer than 32,767 pixels, the output is unknown, mean
+            or std do not fit the channels, or they are missing and the model has none.
+    """
+    from darswin.frames.reading import reading
+
+    if output is not None and output not in get_args(Output):
+        raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
+    size = check_size(size)
+    found = reading(sample, lens, size)
+    return plan_of(sample, found, size, output or found.output, mean, std)
+
+
+def check_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(H, W) of frames; TypeError or ValueError if they are no size of frames."""
+    from darswin.ops.checks import check_pair
+
+    size = check_pair("size", size, 1)
+    if max(size) > _LARGEST_SIDE:
+        raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
+    return size
+
+
+def plan_of(
+    sample: "torch.nn.Module",
+    found: "Reading",
+    size: tuple[int, int],
+    output: Output,
+    mean: float | Sequence[float] | None,
+    std: float | Sequence[float] | None,
+) -> Plan:
+    """The plan of what `reading` found."""
+    from darswin.ops.checks import per_channel
+
+    if output == "uint8":
+        found = found._replace(mean=0.0, std=1.0)
+    mean, std = found.mean if mean is None else mean, found.std if std is None else std
+    if mean is None or std is None:
+        raise ValueError(
+            f"this {type(sample).__name__} does not say how frames are normalised: give the mean "
+            "and the std of its network"
+        )
+    channels = found.channels or max(np.size(mean), np.size(std))
+    points: Any = found.points
+    if found.samples is None:
+        arrays = _at_pixels(points.double().numpy(), size, output, found.tiles, found.reads)
+    else:
+        arrays = _on_grid(points, found.samples, size, output)
+    return Plan(
+        **arrays,
+        size=size,
+        output=output,
+        mean=per_channel("mean", mean, channels),
+        std=per_channel("std", std, channels),
+        reads=found.reads,
+    )
+
+
+def _on_grid(
+    grid: "PolarGrid", samples: tuple[int, int], size: tuple[int, int], output: Output
+) -> dict[str, Any]:
+    """The places of a polar grid of one lens."""
+    affine, offsets = (
+        None if x is None else x.float().numpy() for x in (grid.affine, grid.offsets)
+    )
+    radii, azimuths, center = (x.float().numpy() for x in (grid.radii, grid.azimuths, grid.center))
+    arrays = frames.polar_places(radii, azimuths, center, affine, offsets, size)
+    if output == "tokens":
+        (rows, columns), (sr, sa) = arrays[0].shape, samples
+        arrays = tuple(
+            np.ascontiguousarray(
+                array.reshape(rows // sr, sr, columns // sa, sa).transpose(0, 2, 1, 3)
+            )
+            for array in arrays
+        )
+    return dict(zip(("columns", "rows", "right", "lower"), arrays, strict=True))
+
+
+def _at_pixels(
+    points: np.ndarray, size: tuple[int, int], output: Output, tiles: int, reads: int
+) -> dict[str, Any]:
+    """The places of single points, x and y in px: (reads·H', reads·W', 2), or those of tiles below
+    each other."""
+    if output == "tokens":
+        raise ValueError("only a polar grid has tokens: choose the output 'image' or 'uint8'")
+    x, y = points.transpose(2, 0, 1)
+    inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
+    x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
+    if reads > 1:
+        height, width = (side // reads for side in x.shape)
+        x, y = (v.reshape(height, reads, width, reads).swapaxes(1, 2) for v in (x, y))
+        x, y = (v.reshape(height, width, reads**2) for v in (x, y))
+    if tiles > 1:
+        x, y = (v.reshape(tiles, -1, *v.shape[1:]) for v in (x, y))
+    columns, rows = np.floor(x), np.floor(y)
+    return dict(
+        columns=columns.astype(np.int16),
+        rows=rows.astype(np.int16),
+        right=(x - columns).astype(np.float32),
+        lower=(y - rows).astype(np.float32),
+    )

@@ -1,0 +1,118 @@
+"""`_run`: whole networks as one operator. tests/models compares its results with the models'."""
+
+import math
+
+import pytest
+import torch
+from helpers import network
+
+from darswin import optimize
+from darswin.deploy.forward import frame_program
+from darswin.deploy.program import Program, Weights
+from darswin.lens import Spherical
+
+_run = torch.ops.darswin._run
+
+
+def given(name="darswin_a_nano", **options):
+    """The inputs, the weights and the words of a network's program for one lens."""
+    model = network(name, **options)
+    size = model.image_size or (32, 32)
+    lens = Spherical.from_fov(0.5, math.radians(160), size[0] / 2)
+    fast = optimize(model, lens=lens)
+    prepared = fast.prepare(None, size)
+    found = frame_program(fast, prepared)
+    images = torch.randn(1, 3, *size)
+    inputs = [fast.sample(images, prepared)]
+    inputs += [images.permute(0, 2, 3, 1)] * found.reads_frame
+    want = fast(images)
+    return [*inputs, *(x[None] for x in found.constants)], found.weights, found.words, want
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_ra_nano", "swin_undis_nano", "darswin_unet_a_nano",
+                                  "swin_unet_undis_nano", "swin_unet_nano"])  # fmt: skip
+@pytest.mark.parametrize("options", [{}, dict(task="distance"), dict(skip_width=0, rays=False),
+                                     dict(places=False)])  # fmt: skip
+def test_programs_for_frames(name, options):
+    if options and "unet" not in name:
+        pytest.skip("an option of Unets")
+    inputs, weights, words, want = given(name, **options)
+    (got,) = _run(inputs, weights, words)
+    assert got.shape == want.shape
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5 * want.abs().max().item())
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("output_fmt", ["NHWC", "NCHW"])
+def test_a_backbone_has_several_outputs(output_fmt):
+    options = dict(features_only=True, out_indices=(0, -1), output_fmt=output_fmt)
+    inputs, weights, words, want = given(**options)
+    got = _run(inputs, weights, words)
+    assert [x.shape for x in got] == [x.shape for x in want] and len(got) == 2
+    for x, y in zip(got, want, strict=True):
+        torch.testing.assert_close(x, y)
+
+
+@pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano"])
+def test_wrong_programs_are_refused_or_run(name):
+    inputs, weights, words, _ = given(name)
+    chance = torch.Generator().manual_seed(0)
+
+    def drawn(most):
+        return int(torch.randint(most, (), generator=chance))
+
+    refused = 0
+    for _ in range(400):
+        changed = list(words)
+        for _ in range(1 + drawn(2)):
+            values = (
+                0,
+                -1,
+                1,
+                drawn(20),
+                drawn(5000),
+                words[drawn(len(words))],
+                2**40,
+                2**62,
+                -(2**63),
+            )
+            changed[drawn(len(words))] = values[drawn(len(values))]
+        if drawn(5) == 0:
+            changed = changed[: drawn(len(changed))]
+        try:
+            _run(inputs, weights, changed)
+        except (ValueError, RuntimeError, MemoryError):
+            refused += 1
+    assert refused > 200  # most words matter
+
+
+def test_wrong_inputs_are_refused():
+    inputs, weights, words, _ = given()
+    x, *tables = inputs
+    for changed in (
+        [x], [x[0], *tables], [x.double(), *tables], [x.to("meta"), *tables],
+        [torch.zeros(2, *x.shape[1:]), *(torch.cat([t] * 3) for t in tables)], [],
+    ):  # fmt: skip
+        with pytest.raises((RuntimeError, NotImplementedError), match="_run"):
+            _run(changed, weights, words)
+    for changed in (weights.float(), weights[::2], weights[:-1]):
+        with pytest.raises((RuntimeError, ValueError), match="weights"):
+            _run(inputs, changed, words)
+    assert _run([x[:0], *tables], weights, words)[0].shape == (0, 5)
+
+
+def test_numbers_that_are_copied_and_changed():
+    program = Program(Weights())
+    x = program.input(2, 6, 4)
+    program.output(program.permuted(x, (2, 3, 2, 4), (1, 0, 3, 2), 3, 2, 8))
+    program.output(program.channels_first(x))
+    program.output(program.mean(x))
+    program.output(program.resized(x, (5, 3)))
+    numbers = torch.randn(2, 2, 6, 4)
+    got = _run([numbers], torch.zeros(0, dtype=torch.int32), program.words())
+    permuted = numbers.view(2, 2, 3, 2, 4).permute(0, 2, 1, 4, 3).reshape(2, 3, 2, 8)
+    first = numbers.permute(0, 3, 1, 2)
+    resized = torch.nn.functional.interpolate(first, (5, 3), mode="bilinear").permute(0, 2, 3, 1)
+    for x, want in zip(got, (permuted, first, numbers.mean((1, 2)), resized), strict=True):
+        torch.testing.assert_close(x, want)

@@ -1,0 +1,531 @@
+"""Networks for frames: what their model gives, from any layout, and files that are refused."""
+
+import ctypes
+import os
+import subprocess
+import sys
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
+from torch import nn
+
+from darswin import create_model, frames, list_models, optimize
+from darswin.compat import OfficialDarSwin
+from darswin.deploy.quantize import quantize_model
+from darswin.layers.linear import onednn_lack
+from darswin.lens import Equidistant, Mei, Polynomial
+from darswin.models import Encoder, FeatureMaps, LensAdapter
+
+LENSES = {
+    "round": Equidistant.from_fov(2.8, 30.0),
+    "affine": Polynomial([26.0, -1.1], 1.6, [41.2, 30.3], affine=[[1.0, 0.02], [0.0, 0.9]]),
+    "general": Mei(2.35, 80.0, [0.032, 2.4], 1.7, [40.3, 33.1], tangential=[6e-3, -3.5e-3]),
+}
+REFUSED = {"dat", "conv_unet"}
+FAMILIES = sorted({name.rpartition("_")[0] for name in list_models()} - REFUSED)
+CLASSIFIERS = [name for name in FAMILIES if "unet" not in name]
+CASES = [
+    *((name, {}) for name in FAMILIES),
+    *((name, dict(num_classes=0)) for name in CLASSIFIERS),
+    *((name, dict(features_only=True)) for name in CLASSIFIERS),
+    ("darswin_a", dict(features_only=True, out_indices=(0, 2), output_fmt="NCHW")),
+    ("swin", dict(features_only=True, out_indices=1)),
+    *((name, dict(task="distance")) for name in FAMILIES if "unet" in name),
+    *((name, dict(skip_width=0, places=False)) for name in FAMILIES if "unet" in name),
+    ("darswin_unet_ra", dict(rays=True, num_classes=3)),
+    ("swin_unet", dict(view="mercator", size=(64, 128))),
+    ("swin", dict(image_size=(24, 48), patch_size=3)),
+    ("darswin_a", dict(periodic_bias=True, spacing="g")),
+]
+
+
+def model_of(family="darswin_a", channels=3, **options):
+    """A small model whose signal neither grows nor dies."""
+    torch.manual_seed(0)
+    if family.startswith("swin_unet"):
+        options = dict(image_size=64) | options
+    mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
+    model = create_model(
+        f"{family}_nano", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
+    ).eval()
+    for layer in model.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+    return model
+
+
+def size_of(model):
+    return model.image_size or (70, 80)
+
+
+def network_of(model, folder, lens=ROUND, **options):
+    path = Path(folder, "camera.npz")
+    frames.export(model, lens, size_of(model), path, **options)
+    return frames.Network(path)
+
+
+@torch.no_grad()
+def by_model(model, frame, lens=ROUND):
+    """The model's result for a frame, a list of arrays; a classifier's probabilities."""
+    image = torch.from_numpy(np.ascontiguousarray(frame))
+    image = image[None, None] if frame.ndim == 2 else image.permute(2, 0, 1)[None]
+    result = model(image, lens)
+    if isinstance(model, Encoder) and model.num_classes:
+        result = result.softmax(1)
+    return [one[0].numpy() for one in (result if isinstance(result, list) else [result])]
+
+
+def assert_close(found, expected, of=1e-5):
+    """Equal up to this part of the largest number."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape and one.dtype == other.dtype == np.float32
+        np.testing.assert_allclose(one, other, rtol=of, atol=of * np.abs(other).max())
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize(("family", "options"), CASES, ids=str)
+def test_a_network_gives_what_its_model_gives(family, options, lens, tmp_path):
+    for channels in (3, 1) if lens == "round" else (3,):
+        model = model_of(family, channels, **options)
+        network = network_of(model, tmp_path, LENSES[lens])
+        assert network.size == size_of(model) and network.channels == channels
+        frame = random_frame(*network.size, channels)
+        result, expected = network(frame), by_model(model, frame, LENSES[lens])
+        assert isinstance(result, list) == isinstance(model, FeatureMaps)
+        assert_close(result if isinstance(result, list) else [result], expected)
+        assert network.shapes == [one.shape for one in expected]
+        if channels == 1:
+            gray = network(frame[..., 0])
+            np.testing.assert_array_equal(flat(gray), flat(result))
+
+
+def flat(result):
+    return np.concatenate([x.ravel() for x in (result if isinstance(result, list) else [result])])
+
+
+@pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="no products of 8 bits here")
+@pytest.mark.parametrize("family", ["darswin_a", "darswin_ra", "swin", "darswin_unet_a"])
+def test_quantized_networks_compute_with_8_bits(family, tmp_path):
+    model = model_of(family)
+    pictures = torch.from_numpy(random_frame(*size_of(model), 3, 2)).permute(3, 2, 0, 1)
+    quantized = quantize_model(model, [(pictures, ROUND)])
+    network = network_of(quantized, tmp_path)
+    frame = random_frame(*network.size, 3, seed=7)
+    assert_close([network(frame)], by_model(optimize(quantized, torch.int8), frame))
+    whole = network_of(model, tmp_path)
+    assert Path(tmp_path, "camera.npz").stat().st_size > 0
+    difference = np.abs(whole(frame) - network(frame)).max() / np.abs(whole(frame)).max()
+    assert 1e-5 < difference < 0.5
+
+
+@pytest.mark.parametrize("family", ["darswin_a", "swin", "darswin_unet_a", "swin_unet_adapted"])
+def test_every_layout_and_number_of_threads_gives_the_same_bits(family, tmp_path):
+    network = network_of(model_of(family), tmp_path)
+    frame = random_frame(*network.size, 3)
+    expected = network(frame)
+    for layout in LAYOUTS:
+        for threads in (1, 2, 5):
+            found = network(in_layout(frame, layout), threads=threads)
+            np.testing.assert_array_equal(found, expected)
+    bgr = np.ascontiguousarray(frame[..., ::-1])
+    np.testing.assert_array_equal(network(bgr[..., ::-1]), expected)
+    assert not np.array_equal(network(bgr), expected)
+
+
+def test_threads_of_python_may_share_a_network(tmp_path):
+    network = network_of(model_of("darswin_unet_a"), tmp_path)
+    pictures = [random_frame(*network.size, 3, seed=seed) for seed in range(6)]
+    expected = [network(picture) for picture in pictures]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            results = pool.map(lambda p: network(p, threads=2), pictures)
+            for found, right in zip(results, expected, strict=True):
+                np.testing.assert_array_equal(found, right)
+
+
+def test_out_takes_the_result(tmp_path):
+    network = network_of(model_of(), tmp_path)
+    frame = random_frame(*network.size, 3)
+    expected = network(frame)
+    out = np.full_like(expected, np.nan)
+    assert network(frame, out) is out and network(frame, out=out, threads=2) is out
+    np.testing.assert_array_equal(out, expected)
+    read_only = expected.copy()
+    read_only.flags.writeable = False
+    for wrong in (expected.astype(np.float64), expected[:-1], read_only, np.repeat(out, 2)[::2]):
+        with pytest.raises(ValueError, match=r"out must be .* of float32 with shape \(10\)"):
+            network(frame, wrong)
+    with pytest.raises(TypeError, match=r"out must be a NumPy array, got .*list"):
+        network(frame, [out])
+    inside = frame.reshape(-1)[: out.nbytes].view(np.float32)
+    with pytest.raises(ValueError, match="out must not share memory with the frame"):
+        network(frame, inside)
+
+
+def test_a_list_of_outs_takes_the_maps(tmp_path):
+    network = network_of(model_of(features_only=True), tmp_path)
+    frame = random_frame(*network.size, 3)
+    expected = network(frame)
+    out = [np.full_like(one, np.nan) for one in expected]
+    assert network(frame, out) is out
+    for one, right in zip(out, expected, strict=True):
+        np.testing.assert_array_equal(one, right)
+    for wrong in (out[0], out[:-1], tuple(out), 1):
+        with pytest.raises(TypeError, match="out must be a list of 3 arrays"):
+            network(frame, wrong)
+    with pytest.raises(ValueError, match="with shape"):
+        network(frame, out[::-1])
+    memory = np.zeros(sum(one.size for one in out), np.float32)
+    shared = [memory[: one.size].reshape(one.shape) for one in out]
+    with pytest.raises(ValueError, match="the arrays of out must not share memory"):
+        network(frame, shared)
+
+
+@pytest.mark.parametrize(
+    ("frame", "error", "words"),
+    [
+        (random_frame(80, 70, 3), ValueError, r"\(H, W\) = \(70, 80\), got \(80, 70\)"),
+        (random_frame(70, 80, 4), ValueError, r"shape \(H, W\).*got \(70, 80, 4\)"),
+        (random_frame(70, 80), ValueError, "the network's 3 channels, got 1"),
+        (random_frame(70, 80, 3).astype(np.float32), TypeError, "array of uint8, got float32"),
+        (torch.zeros(70, 80, 3, dtype=torch.uint8), TypeError, "array of uint8, got .*Tensor"),
+    ],
+)
+def test_wrong_frames_are_explained(frame, error, words, tmp_path):
+    network = network_of(model_of(), tmp_path)
+    with pytest.raises(error, match=words):
+        network(frame)
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        network(random_frame(70, 80, 3), threads=0)
+
+
+def test_labels_and_normalization(tmp_path):
+    names = ["naïve", "車", "𝄞", "d", "", "f", "g", "h", "i", "j" * 99]
+    model = model_of()
+    assert network_of(model, tmp_path).labels == []
+    assert network_of(model, tmp_path, labels=tuple(names)).labels == names
+    model.pretrained_cfg["label_names"] = names[::-1]
+    assert network_of(model, tmp_path).labels == names[::-1]
+    assert network_of(model, tmp_path, labels=[]).labels == []
+    other = network_of(model, tmp_path, mean=0.1, std=(0.5, 0.6, 0.7))
+    model.view.mean, model.view.std = (0.1,) * 3, (0.5, 0.6, 0.7)
+    frame = random_frame(*other.size, 3)
+    assert_close([other(frame)], by_model(model, frame))
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "error", "words"),
+    [
+        (lambda: model_of("dat"), dict(size=(32, 32)), TypeError, "got DAT"),
+        (lambda: model_of("conv_unet"), {}, TypeError, "got ConvUnet"),
+        (lambda: model_of().to(torch.bfloat16), {}, TypeError, "float32 weights, got .*bfloat16"),
+        (lambda: model_of().double(), {}, TypeError, "float32 weights, got .*float64"),
+        (lambda: LensAdapter(nn.Flatten(), 8, view="tiles", mean=0, std=1), {}, TypeError,
+         "got LensAdapter"),
+        (lambda: nn.Linear(2, 2), {}, TypeError, "got Linear"),
+        (lambda: "model", {}, TypeError, "got str"),
+        (lambda: optimize(model_of()), {}, TypeError, "got an optimized model"),
+        (lambda: model_of().train(), {}, ValueError, "eval mode"),
+        (lambda: model_of("swin"), dict(size=(40, 40)), ValueError, r"image_size, \(32, 32\)"),
+        (lambda: model_of(in_chans=2, mean=0, std=1), {}, ValueError, "1 mean, or 3 for RGB"),
+        (model_of, dict(lens=Equidistant([9.0, 8.0])), ValueError, "one lens, got 2"),
+        (model_of, dict(lens=None), TypeError, "lens must be"),
+        (model_of, dict(size=(50, 40_000)), ValueError, "at most 32767"),
+        (model_of, dict(size=(50.5, 40)), TypeError, "size must be a pair of ints"),
+        (model_of, dict(labels=["a"]), ValueError, "labels must be 10 names"),
+        (model_of, dict(labels=[1] * 10), ValueError, "labels must be 10 names"),
+        (model_of, dict(mean=(0.1, 0.2)), ValueError, "one per channel"),
+        (model_of, dict(std=0.0), ValueError, "std must be positive"),
+        (model_of, dict(path="camera.onnx"), ValueError, r"must end in \.npz"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_exported_is_explained(model, changes, error, words, tmp_path):
+    options = dict(lens=ROUND, size=(50, 60), path="camera.npz") | changes
+    path = tmp_path / options.pop("path")
+    with pytest.raises(error, match=words):
+        frames.export(model(), options.pop("lens"), options.pop("size"), path, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_that_ignores_its_lens_needs_none(tmp_path):
+    model = model_of("swin")
+    network = network_of(model, tmp_path, None)
+    frame = random_frame(32, 32, 3)
+    assert_close([network(frame)], by_model(model, frame, None))
+
+
+def test_the_released_model_can_be_exported(tmp_path):
+    torch.manual_seed(0)
+    options = dict(embed_dim=24, depths=(1, 1), num_heads=(1, 2), samples=(4, 4), num_classes=10)
+    model = OfficialDarSwin(**options, mean=0.4, std=0.2).eval()
+    frames.export(model, ROUND, (64, 64), tmp_path / "camera.npz")
+    frame = random_frame(64, 64, 3)
+    found = frames.Network(tmp_path / "camera.npz")(frame)
+    assert_close([found], by_model(model, frame))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The file of a small network, a frame, and its result."""
+    options = dict(rings=2, sectors=8, samples=(2, 2), embed_dim=8, depths=(1, 1), num_heads=(1, 2))
+    folder = tmp_path_factory.mktemp("small")
+    network = network_of(model_of(**options), folder, labels=list("abcdefghij"))
+    frame = random_frame(*network.size, 3)
+    return (folder / "camera.npz").read_bytes(), frame, network(frame)
+
+
+def opens(path, frame, expected):
+    """True if a damaged file still gives the right answer; False if it is refused."""
+    try:
+        network = frames.Network(path)
+    except ValueError as error:
+        assert f"{path} is no network that darswin.frames can read: " in str(error)
+        return False
+    np.testing.assert_array_equal(network(frame), expected)
+    assert network.labels == list("abcdefghij")
+    return True
+
+
+def test_damaged_files_are_refused_or_harmless(small, tmp_path):
+    content, frame, expected = small
+    path, rng = tmp_path / "camera.npz", np.random.default_rng(0)
+    before, harmless = len(os.listdir("/proc/self/fd")), 0
+    directory = content.index(b"PK\1\2")  # what follows says where all arrays are
+    for k in range(6000):
+        damaged = bytearray(content)
+        first = directory if k % 2 else 0
+        place = int(rng.integers(first, len(content)))
+        noise = rng.integers(0, 256, int(rng.integers(1, 9)), np.uint8).tobytes()
+        if k % 3 == 0:  # one bit, or a large number
+            noise = bytes([content[place] ^ 1 << int(rng.integers(8))])
+        elif k % 3 == 1:
+            noise = bytes([255]) * len(noise)
+        damaged[place : place + len(noise)] = noise
+        path.write_bytes(damaged[: len(content)])
+        harmless += opens(path, frame, expected)
+    assert 0 < harmless < 3000
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_files_that_end_too_early_are_refused(small, tmp_path):
+    content, frame, expected = small
+    path = tmp_path / "camera.npz"
+    for length in [*range(0, len(content), 997), *range(len(content) - 80, len(content))]:
+        path.write_bytes(content[:length])
+        assert not opens(path, frame, expected), length
+    path.write_bytes(content + b"x")
+    assert not opens(path, frame, expected)
+    path.write_bytes(b"x" + content)
+    assert not opens(path, frame, expected)
+
+
+def test_programs_that_were_not_written_do_no_harm(small, tmp_path):
+    """Even if the archive around them is whole."""
+    content, frame, _ = small
+    path, rng = tmp_path / "camera.npz", np.random.default_rng(0)
+    arrays = dict(np.load(BytesIO(content)))
+    refused = 0
+    for k in range(1500):
+        program = arrays["program"].copy()
+        value = rng.choice([-1, 0, 1, 2, 7, 255, 2**20, 2**31, 2**40, 2**62, -(2**63)])
+        program[rng.integers(len(program))] = value if k % 2 else rng.integers(0, 64)
+        np.savez(path, **arrays | dict(program=program))
+        try:
+            frames.Network(path)(frame)
+        except (ValueError, MemoryError):
+            refused += 1
+    assert refused > 500
+
+
+def header(descr="<f4", order="False", shape="(2,)", ending=", }"):
+    text = f"{{'descr': '{descr}', 'fortran_order': {order}, 'shape': {shape}{ending}"
+    text += " " * (-(len(text) + 11) % 64) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+WRONG_ARRAYS = [
+    b"", b"\x93NUM", b"\x93NUMPY\x01\x00\xff\xff", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{",
+    header(shape="(4611686018427387904, 4)"), header(shape="(2305843009213693952,)"),
+    header(shape="(99999999999999999999,)"), header(shape="(-2,)"), header(shape="(0, 9"),
+    header(shape="(1000000000000,)", descr="<U0"), header(shape="(1,)", descr="<U9999999999"),
+    header(shape="(0, 9223372036854775807, 9223372036854775807)"),
+    header(shape="(3,)") + bytes(8), header(shape="(1,)") + bytes(8), header(descr="<f"),
+    header(descr=">f4") + bytes(8), header(order="True") + bytes(8),
+    header(descr="|O") + bytes(8),
+    header(ending="") + bytes(8), header(ending=", 'more': 1}") + bytes(8),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("array", WRONG_ARRAYS)
+def test_arrays_that_numpy_does_not_write_are_refused(array, small, tmp_path):
+    content, frame, expected = small
+    path = tmp_path / "camera.npz"
+    for name in ("constants.npy", "labels.npy", "plan.size.npy"):
+        with zipfile.ZipFile(BytesIO(content)) as old, zipfile.ZipFile(path, "w") as new:
+            for one in old.namelist():
+                new.writestr(one, array if one == name else old.read(one))
+        assert not opens(path, frame, expected)
+
+
+def test_values_that_do_not_fit_are_refused(small, tmp_path):
+    content, frame, expected = small
+    path, arrays = tmp_path / "camera.npz", dict(np.load(BytesIO(content)))
+    np.savez(path, **arrays)
+    assert opens(path, frame, expected)
+    np.savez(path, **arrays, more=np.zeros(3))  # as a later minor version may
+    assert opens(path, frame, expected)
+    assert {type(frames.Network(path).size), type(frames.Network(path).labels)} == {tuple, list}
+    for name, array in arrays.items():
+        others = [
+            array[..., None][:0] if name != "labels" else array[:-1],
+            array.astype(np.complex64) if array.dtype.kind != "U" else 1,
+        ]
+        if array.dtype.kind in "if":
+            others += [array.astype(np.int8), array.ravel()[1:]]
+            if name != "weights":  # more of them do no harm
+                others.append(np.append(array, array))
+        for other in others:
+            np.savez(path, **arrays | {name: other})
+            assert not opens(path, frame, expected), (name, other)
+        np.savez(path, **{one: value for one, value in arrays.items() if one != name})
+        assert not opens(path, frame, expected), name
+    for name, value, words in (
+        ("darswin_network", np.array([2, 0]), "newer version of darswin: update darswin"),
+        ("darswin_network", np.array([0, 9]), "older version"),
+        ("finish", np.array("sigmoid"), "not known"),
+        ("plan.output", np.array("uint8"), "plan"),
+        ("plan.output", np.array("image"), "plan"),
+        ("plan.right", arrays["plan.right"] + 2, "distances outside"),
+        ("plan.size", np.array([0, 4]), "plan"),
+        ("plan.reads", np.array(2**33), "plan"),
+        ("reads_frame", np.array(1), "inputs"),
+        ("weights", arrays["weights"][:-100], "program"),
+    ):
+        np.savez(path, **arrays | {name: value})
+        with pytest.raises(ValueError, match=words):
+            frames.Network(path)
+    np.savez_compressed(path, **arrays)
+    with pytest.raises(ValueError, match="without compression"):
+        frames.Network(path)
+    frames.plan(model_of(), ROUND, (70, 80)).save(path)
+    with pytest.raises(ValueError, match="'darswin_network' is missing"):
+        frames.Network(path)
+
+
+def test_what_is_no_file_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        frames.Network(tmp_path / "missing.npz")
+    assert caught.value.filename == str(tmp_path / "missing.npz")
+    with pytest.raises(IsADirectoryError):
+        frames.Network(tmp_path)
+    os.mkfifo(tmp_path / "pipe.npz")
+    for path in (tmp_path / "pipe.npz", "/dev/zero", "/dev/null"):
+        with pytest.raises(ValueError, match="is no network"):
+            frames.Network(path)
+
+
+class Frame(ctypes.Structure):
+    _fields_ = [("pixels", ctypes.c_void_p)] + [
+        (name, ctypes.c_int64)
+        for name in ["height", "width", "channels", "row_stride", "column_stride", "channel_stride"]
+    ]
+
+
+def test_the_c_interface(tmp_path):
+    library = ctypes.CDLL(str(Path(frames.__file__).parent / "libdarswin_frames.so"))
+    pointer, number, text = ctypes.c_void_p, ctypes.c_int64, ctypes.c_char_p
+    for name, result, *arguments in (
+        ("version", text), ("file_version", text), ("last_error", text), ("load", pointer, text),
+        ("free", None, pointer), ("frame_size", None, pointer, number * 3),
+        ("output_count", number, pointer), ("output_axes", number, pointer, number),
+        ("output_shape", ctypes.POINTER(number), pointer, number),
+        ("output_numbers", number, pointer, number), ("label_count", number, pointer),
+        ("label", text, pointer, number),
+        ("run", ctypes.c_int, pointer, ctypes.POINTER(Frame), ctypes.POINTER(pointer), number),
+    ):  # fmt: skip
+        function = getattr(library, f"darswin_{name}")
+        function.restype, function.argtypes = result, arguments
+    assert library.darswin_file_version() == b"1.0"
+    toml = Path(__file__).parent.parent.joinpath("pyproject.toml").read_text()
+    assert f'\nversion = "{library.darswin_version().decode()}"\n' in toml
+
+    for model in (model_of(), model_of(features_only=True), model_of("darswin_unet_a")):
+        labels = ["ä"] * model.num_classes if isinstance(model, Encoder) else []
+        network = network_of(model, tmp_path, labels=labels)
+        frame = random_frame(*network.size, 3)
+        expected = network(frame)
+        expected = expected if isinstance(expected, list) else [expected]
+        loaded = library.darswin_load(os.fsencode(tmp_path / "camera.npz"))
+        assert loaded, library.darswin_last_error()
+        size = (number * 3)()
+        library.darswin_frame_size(loaded, size)
+        assert tuple(size) == (*network.size, 3)
+        assert library.darswin_output_count(loaded) == len(expected)
+        outs = []
+        for k, right in enumerate(expected):
+            axes = library.darswin_output_axes(loaded, k)
+            assert tuple(library.darswin_output_shape(loaded, k)[:axes]) == right.shape
+            assert library.darswin_output_numbers(loaded, k) == right.size
+            outs.append(np.full_like(right, np.nan))
+        for k in (-1, len(expected)):
+            assert library.darswin_output_axes(loaded, k) == -1
+            assert library.darswin_output_numbers(loaded, k) == -1
+            assert not library.darswin_output_shape(loaded, k)
+        assert library.darswin_label_count(loaded) == len(labels)
+        for k in range(-1, len(labels) + 1):
+            known = 0 <= k < len(labels)
+            assert library.darswin_label(loaded, k) == ("ä".encode() if known else None)
+        outputs = (pointer * len(outs))(*(out.ctypes.data for out in outs))
+        for given in (frame, in_layout(frame, "flipped"), in_layout(frame, "bgr")):
+            c_frame = Frame(given.ctypes.data, *given.shape, *given.strides)
+            assert library.darswin_run(loaded, c_frame, outputs, 2) == 0
+            for out, right in zip(outs, expected, strict=True):
+                np.testing.assert_array_equal(out, right)
+                out.fill(np.nan)
+        small, none = Frame(frame.ctypes.data, 5, 5, 3, 15, 3, 1), Frame()
+        for arguments, words in (
+            ((loaded, small, outputs, 1), b"(H, W) = (70, 80), got (5, 5)"),
+            ((loaded, none, outputs, 1), b"must not be NULL"),
+            ((loaded, None, outputs, 1), b"must not be NULL"),
+            ((loaded, c_frame, None, 1), b"must not be NULL"),
+            ((loaded, c_frame, (pointer * len(outs))(), 1), b"must not be NULL"),
+            ((loaded, c_frame, outputs, 0), b"threads must be at least 1"),
+            ((None, c_frame, outputs, 1), b"must not be NULL"),
+        ):
+            assert library.darswin_run(*arguments) == -1
+            assert words in library.darswin_last_error()
+        library.darswin_free(loaded)
+    library.darswin_free(None)
+    for path, words in ((None, b"NULL"), (b"/missing.npz", b"/missing.npz: No such file"),
+                        (os.fsencode(__file__), b"is no network")):  # fmt: skip
+        assert library.darswin_load(path) is None and words in library.darswin_last_error()
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("tier", ["default", "avx2", "avx512"])
+def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_path):
+    model = create_model("darswin_a_micro", num_classes=10, mean=MEAN, std=STD).eval()
+    frame = random_frame(966, 1280, 3)
+    frames.export(model, ROUND, frame.shape[:2], tmp_path / "camera.npz")
+    np.save(tmp_path / "frame.npy", frame)
+    code = """if True:
+        import re, sys
+        import numpy as np
+        import darswin.frames
+        network = darswin.frames.Network("camera.npz")
+        np.save("found.npy", network(np.load("frame.npy")))
+        assert not {"torch", "cv2"} & set(sys.modules)
+        peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1])
+        assert peak < 60_000, peak
+    """
+    environment = os.environ | {"ATEN_CPU_CAPABILITY": tier}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
+    assert_close([np.load(tmp_path / "found.npy")], by_model(model, frame))
