@@ -455,7 +455,7 @@ def test_the_c_interface(tmp_path):
     pointer, number, text = ctypes.c_void_p, ctypes.c_int64, ctypes.c_char_p
     for name, result, *arguments in (
         ("version", text), ("file_version", text), ("last_error", text), ("load", pointer, text),
-        ("free", None, pointer), ("frame_size", None, pointer, number * 3),
+        ("free", None, pointer), ("frame_size", ctypes.c_int, pointer, number * 3),
         ("output_count", number, pointer), ("output_axes", number, pointer, number),
         ("output_shape", ctypes.POINTER(number), pointer, number),
         ("output_numbers", number, pointer, number), ("label_count", number, pointer),
@@ -477,7 +477,7 @@ def test_the_c_interface(tmp_path):
         loaded = library.darswin_load(os.fsencode(tmp_path / "camera.npz"))
         assert loaded, library.darswin_last_error()
         size = (number * 3)()
-        library.darswin_frame_size(loaded, size)
+        assert library.darswin_frame_size(loaded, size) == 0
         assert tuple(size) == (*network.size, 3)
         assert library.darswin_output_count(loaded) == len(expected)
         outs = []
@@ -515,6 +515,10 @@ def test_the_c_interface(tmp_path):
             assert words in library.darswin_last_error()
         library.darswin_free(loaded)
     library.darswin_free(None)
+    assert library.darswin_frame_size(None, size) == library.darswin_output_count(None) == -1
+    assert library.darswin_label_count(None) == library.darswin_output_axes(None, 0) == -1
+    assert library.darswin_label(None, 0) is None and not library.darswin_output_shape(None, 0)
+    assert b"network must not be NULL" in library.darswin_last_error()
     for path, words in ((None, b"NULL"), (b"/missing.npz", b"/missing.npz: No such file"),
                         (os.fsencode(__file__), b"is no network")):  # fmt: skip
         assert library.darswin_load(path) is None and words in library.darswin_last_error()

@@ -5,6 +5,7 @@
 #include <stdexcept>
 #include <string>
 #include <system_error>
+#include <vector>
 
 #include "../core/network_file.h"
 #include "../core/parallel.h"
@@ -40,9 +41,14 @@ void require(bool condition, const char* what) {
   if (!condition) throw std::invalid_argument(what);
 }
 
-void check_output(const darswin_network* network, int64_t k) {
-  require(network != nullptr && k >= 0 && k < network->output_count(),
-          "there is no such network or output");
+const darswin_network& given(const darswin_network* network) {
+  require(network != nullptr, "network must not be NULL");
+  return *network;
+}
+
+const std::vector<int64_t>& shape_of(const darswin_network* network, int64_t k) {
+  require(k >= 0 && k < given(network).output_count(), "there is no such output");
+  return network->output_shape(k);
 }
 
 }  // namespace
@@ -72,52 +78,51 @@ DARSWIN_API darswin_network* darswin_load(const char* path) {
 
 DARSWIN_API void darswin_free(darswin_network* network) { delete network; }
 
-DARSWIN_API void darswin_frame_size(const darswin_network* network, int64_t size[3]) {
-  size[0] = network->height(), size[1] = network->width(), size[2] = network->channels();
+DARSWIN_API int darswin_frame_size(const darswin_network* network, int64_t size[3]) {
+  return caught(
+      [&] {
+        size[0] = given(network).height();
+        size[1] = network->width(), size[2] = network->channels();
+        return 0;
+      },
+      -1);
 }
 
 DARSWIN_API int64_t darswin_output_count(const darswin_network* network) {
-  return network->output_count();
+  return caught([&] { return given(network).output_count(); }, int64_t{-1});
 }
 
 DARSWIN_API const int64_t* darswin_output_shape(const darswin_network* network, int64_t output) {
-  return caught(
-      [&] {
-        check_output(network, output);
-        return network->output_shape(output).data();
-      },
-      static_cast<const int64_t*>(nullptr));
+  return caught([&] { return shape_of(network, output).data(); },
+                static_cast<const int64_t*>(nullptr));
 }
 
 DARSWIN_API int64_t darswin_output_axes(const darswin_network* network, int64_t output) {
-  return caught(
-      [&] {
-        check_output(network, output);
-        return static_cast<int64_t>(network->output_shape(output).size());
-      },
-      int64_t{-1});
+  return caught([&] { return static_cast<int64_t>(shape_of(network, output).size()); },
+                int64_t{-1});
 }
 
 DARSWIN_API int64_t darswin_output_numbers(const darswin_network* network, int64_t output) {
   return caught(
       [&] {
-        check_output(network, output);
         int64_t numbers = 1;
-        for (const int64_t size : network->output_shape(output)) numbers *= size;
+        for (const int64_t size : shape_of(network, output)) numbers *= size;
         return numbers;
       },
       int64_t{-1});
 }
 
 DARSWIN_API int64_t darswin_label_count(const darswin_network* network) {
-  return static_cast<int64_t>(network->labels().size());
+  return caught([&] { return static_cast<int64_t>(given(network).labels().size()); }, int64_t{-1});
 }
 
 DARSWIN_API const char* darswin_label(const darswin_network* network, int64_t label) {
   return caught(
       [&] {
-        require(label >= 0 && label < darswin_label_count(network), "there is no such label");
-        return network->labels()[label].c_str();
+        const auto& labels = given(network).labels();
+        require(label >= 0 && label < static_cast<int64_t>(labels.size()),
+                "there is no such label");
+        return labels[label].c_str();
       },
       static_cast<const char*>(nullptr));
 }
@@ -126,11 +131,10 @@ DARSWIN_API int darswin_run(const darswin_network* network, const darswin_frame*
                             float* const* outputs, int64_t threads) {
   return caught(
       [&] {
-        require(network != nullptr && frame != nullptr && frame->pixels != nullptr &&
-                    outputs != nullptr,
-                "network, frame, its pixels and outputs must not be NULL");
+        require(frame != nullptr && frame->pixels != nullptr && outputs != nullptr,
+                "frame, its pixels and outputs must not be NULL");
         require(threads >= 1, "threads must be at least 1");
-        for (int64_t k = 0; k < network->output_count(); ++k) {
+        for (int64_t k = 0; k < given(network).output_count(); ++k) {
           require(outputs[k] != nullptr, "outputs must not be NULL");
         }
         const darswin::Frame pixels{frame->pixels,        frame->height,     frame->width,

@@ -67,7 +67,7 @@ def optimize(
             calibration without int8 or for a quantized model; int8 with neither.
         ImportError: darswin's compiled module cannot be loaded.
     """
-    _check(model, dtype, lens)
+    check_model(model, dtype, lens)
     _module.require("optimize")
     if dtype == "fastest":
         is_whole = calibration is None and not quantized_layers(model)
@@ -99,7 +99,8 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
     return model if calibration is None else quantize_model(model, calibration)
 
 
-def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
+def check_model(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
+    """TypeError or ValueError for what `optimize` does not take."""
     if not isinstance(model, (Encoder, PixelModel, FeatureMaps)):
         raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
     if isinstance(model, Optimized):

@@ -94,7 +94,7 @@ def export(
     import torch
 
     from darswin.deploy.forward import NoProgramError, frame_program
-    from darswin.deploy.optimize import optimize
+    from darswin.deploy.optimize import check_model, optimize
     from darswin.deploy.packed import own_alone
     from darswin.frames.reading import every_pixel, reading
     from darswin.layers.quantized import quantized_layers
@@ -102,9 +102,7 @@ def export(
 
     check_name(path)
     size = check_size(size)
-    is_quantized = bool(quantized_layers(model)) if isinstance(model, torch.nn.Module) else False
-    with own_alone():
-        fast = optimize(model, torch.int8 if is_quantized else torch.float32)
+    check_model(model, torch.float32, None)
     if model.dtype != torch.float32:
         raise TypeError(f"model must have float32 weights, got {model.dtype}")
     if model.training:
@@ -120,7 +118,8 @@ def export(
         found = every_pixel(model, size)
     plan = plan_of(model, found, size, found.output, mean, std)
     try:
-        with torch.no_grad():
+        with torch.no_grad(), own_alone():
+            fast = optimize(model, torch.int8 if quantized_layers(model) else torch.float32)
             program = frame_program(fast, fast.prepare(lens, size))
     except NoProgramError as error:
         raise TypeError(

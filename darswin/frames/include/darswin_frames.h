@@ -34,8 +34,8 @@ const char* darswin_last_error(void);
 darswin_network* darswin_load(const char* path);
 void darswin_free(darswin_network* network);
 
-/* The size of the frames: height, width, channels. */
-void darswin_frame_size(const darswin_network* network, int64_t size[3]);
+/* Writes the size of the frames: height, width, channels. Returns 0, or -1. */
+int darswin_frame_size(const darswin_network* network, int64_t size[3]);
 
 /* A classifier has one output, its probabilities; others have maps. An output has `axes` axes of
  * the sizes `shape`, and no function has an output beyond the last one: NULL or -1. */
