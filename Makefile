@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -78,6 +78,9 @@ test-asan: build  ## test the operators on every tier with AddressSanitizer and 
 CLANG := build/clang
 CLANG_CXX ?= clang++-16
 
+test-tsan: build  ## test the pool of threads with ThreadSanitizer, calls of several threads, and forks
+	$(PYTEST) -q tests/ops/test_threads.py
+
 test-clang: build  ## test the operators and frames as clang compiles them; CLANG_CXX=clang++-16 is the compiler
 	@rm -rf $(CLANG)/darswin
 	@PATH=$(CURDIR)/$(BIN):$$PATH CXX=$(CLANG_CXX) DARSWIN_BUILD=cmake-clang \
@@ -99,12 +102,12 @@ lint: $(STAMP)  ## check the code with ruff, mypy and clang-format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/clang-format --dry-run --Werror $$(find csrc examples -name '*.h' -o -name '*.cpp')
+	$(BIN)/clang-format --dry-run --Werror $$(find csrc examples tests/cpp -name '*.h' -o -name '*.cpp')
 
 format: $(STAMP)  ## format the code with ruff and clang-format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/clang-format -i $$(find csrc examples -name '*.h' -o -name '*.cpp')
+	$(BIN)/clang-format -i $$(find csrc examples tests/cpp -name '*.h' -o -name '*.cpp')
 
 bench: build  ## time the operators against alternatives, and training; run nothing else meanwhile
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results

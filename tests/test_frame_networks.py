@@ -17,8 +17,8 @@ from torch import nn
 
 from darswin import create_model, frames, list_models, optimize
 from darswin.compat import OfficialDarSwin
+from darswin.deploy import packed
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.linear import onednn_lack
 from darswin.lens import Equidistant, Mei, Polynomial
 from darswin.models import Encoder, FeatureMaps, LensAdapter
 
@@ -110,19 +110,31 @@ def flat(result):
     return np.concatenate([x.ravel() for x in (result if isinstance(result, list) else [result])])
 
 
-@pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="no products of 8 bits here")
-@pytest.mark.parametrize("family", ["darswin_a", "darswin_ra", "swin", "darswin_unet_a"])
-def test_quantized_networks_compute_with_8_bits(family, tmp_path):
-    model = model_of(family)
+def quantized_of(model):
     pictures = torch.from_numpy(random_frame(*size_of(model), 3, 2)).permute(3, 2, 0, 1)
-    quantized = quantize_model(model, [(pictures, ROUND)])
+    return quantize_model(model, [(pictures, ROUND)])
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize(
+    ("family", "options"),
+    [*((name, {}) for name in FAMILIES), ("darswin_a", dict(features_only=True))],
+    ids=str,
+)
+def test_quantized_networks_compute_with_8_bits(family, options, own, tmp_path, monkeypatch):
+    model = model_of(family, **options)
+    quantized = quantized_of(model)
+    expected_of = optimize(quantized, torch.int8)
+    monkeypatch.setattr(packed, "has_own_int8", lambda: own)  # False: this CPU has AMX
     network = network_of(quantized, tmp_path)
     frame = random_frame(*network.size, 3, seed=7)
-    assert_close([network(frame)], by_model(optimize(quantized, torch.int8), frame))
-    whole = network_of(model, tmp_path)
-    assert Path(tmp_path, "camera.npz").stat().st_size > 0
-    difference = np.abs(whole(frame) - network(frame)).max() / np.abs(whole(frame)).max()
-    assert 1e-5 < difference < 0.5
+    found, expected = network(frame), by_model(model, frame)
+    found = found if isinstance(found, list) else [found]
+    # A view is sampled by another operator: a rounding may fall to the other side.
+    polar = family.startswith("darswin")
+    assert_close(found, by_model(expected_of, frame), 1e-5 if polar else 0.05)
+    for one, whole in zip(found, expected, strict=True):
+        assert 1e-5 < np.abs(one - whole).max() / np.abs(whole).max() < 0.5
 
 
 @pytest.mark.parametrize("family", ["darswin_a", "swin", "darswin_unet_a", "swin_unet_adapted"])
@@ -515,13 +527,17 @@ def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_pat
     model = create_model("darswin_a_micro", num_classes=10, mean=MEAN, std=STD).eval()
     frame = random_frame(966, 1280, 3)
     frames.export(model, ROUND, frame.shape[:2], tmp_path / "camera.npz")
+    small = quantized_of(model_of())
+    frames.export(small, ROUND, (70, 80), tmp_path / "quantized.npz")
     np.save(tmp_path / "frame.npy", frame)
     code = """if True:
         import re, sys
         import numpy as np
         import darswin.frames
         network = darswin.frames.Network("camera.npz")
-        np.save("found.npy", network(np.load("frame.npy")))
+        frame = np.load("frame.npy")
+        np.save("found.npy", network(frame))
+        np.save("quantized.npy", darswin.frames.Network("quantized.npz")(frame[:70, :80]))
         assert not {"torch", "cv2"} & set(sys.modules)
         peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1])
         assert peak < 60_000, peak
@@ -529,3 +545,5 @@ def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_pat
     environment = os.environ | {"ATEN_CPU_CAPABILITY": tier}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert_close([np.load(tmp_path / "found.npy")], by_model(model, frame))
+    expected = by_model(optimize(small, torch.int8), frame[:70, :80])
+    assert_close([np.load(tmp_path / "quantized.npy")], expected, 0.05)

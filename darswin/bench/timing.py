@@ -121,8 +121,9 @@ def in_turns(
 ) -> dict[Key, list[Turn]]:
     """Calls each candidate for about `seconds`, at least `least` times, in as many turns.
 
-    With a `pace`, calls begin at multiples of so many seconds, and the first one of a turn, which
-    wakes threads and fills caches, does not count. Who takes longer misses frames.
+    With a `pace`, calls begin at multiples of so many seconds, and who takes longer misses frames.
+    A turn begins when the threads of the one before have stopped to look for work. Its first call,
+    which fills caches, does not count.
     """
     calls, turns = {}, 1
     for name, run in candidates.items():
@@ -134,10 +135,21 @@ def in_turns(
     found: dict[Key, list[Turn]] = {name: [] for name in candidates}
     for _ in range(turns):
         for name, run in candidates.items():
+            if pace:
+                _rest(pace)
             if pace or calls[name] > 1:
                 _turn(run, 1, pace)
             found[name].append(_turn(run, calls[name], pace))
     return found
+
+
+def _rest(seconds: float) -> None:
+    """Waits until the process does nothing for so long, or for thirty times as long."""
+    for _ in range(30):
+        cpu = time.process_time()
+        time.sleep(seconds)
+        if time.process_time() - cpu < 0.05 * seconds:
+            return
 
 
 def _turn(run: Callable[[], object], calls: int, pace: float) -> Turn:

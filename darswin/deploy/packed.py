@@ -4,7 +4,8 @@ They are plain callables: a module would take a microsecond more for each call.
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from functools import cache, cached_property, partial
 from typing import Any
 
@@ -43,6 +44,19 @@ _ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
 def has_own_int8() -> bool:
     """True if our own kernels compute 8-bit products here: not where oneDNN uses AMX."""
     return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
+
+
+_OWN_ALONE = ContextVar("own_alone", default=False)
+
+
+@contextlib.contextmanager
+def own_alone() -> Iterator[None]:
+    """Within this context, `library` chooses our own operators where oneDNN is faster too."""
+    token = _OWN_ALONE.set(True)
+    try:
+        yield
+    finally:
+        _OWN_ALONE.reset(token)
 
 
 class OwnBlocks(PackedBlocks):
@@ -188,7 +202,9 @@ class OneDNN(Own):
 
 def library(layer: nn.Module, dtype: torch.dtype) -> Own:
     """The library that computes a layer, or a part of a model, fastest here."""
-    own = dtype == torch.float32 and (not quantized_layers(layer) or has_own_int8())
+    own = dtype == torch.float32 and (
+        not quantized_layers(layer) or has_own_int8() or _OWN_ALONE.get()
+    )
     return Own() if own else OneDNN(dtype)
 
 

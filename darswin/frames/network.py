@@ -95,6 +95,7 @@ def export(
 
     from darswin.deploy.forward import NoProgramError, frame_program
     from darswin.deploy.optimize import optimize
+    from darswin.deploy.packed import own_alone
     from darswin.frames.reading import every_pixel, reading
     from darswin.layers.quantized import quantized_layers
     from darswin.models.encoder import FeatureMaps
@@ -102,7 +103,8 @@ def export(
     check_name(path)
     size = check_size(size)
     is_quantized = bool(quantized_layers(model)) if isinstance(model, torch.nn.Module) else False
-    fast = optimize(model, torch.int8 if is_quantized else torch.float32)
+    with own_alone():
+        fast = optimize(model, torch.int8 if is_quantized else torch.float32)
     if model.dtype != torch.float32:
         raise TypeError(f"model must have float32 weights, got {model.dtype}")
     if model.training:

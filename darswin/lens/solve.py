@@ -50,7 +50,7 @@ def _brackets(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Below and above the x of `inverse`, and a first guess of it."""
     high = torch.broadcast_tensors(end, value)[0]
-    few = high.numel() < 4 * _TABLE * end.numel()
+    few = high.numel() <= 4 * _TABLE * end.numel()
     if few or not eager or end.dim() == 0:
         return torch.zeros_like(high), high, high * (value / function(end)).clamp(0, 1)
     # With one end for many values, as for the pixels of an image: from a table.

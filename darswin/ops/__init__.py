@@ -3,8 +3,7 @@
 On the CPU they run compiled code. On other devices, within `use_reference`, and where the compiled
 module cannot be loaded, they run the PyTorch reference.
 
-They use as many threads as torch. A process that is forked after such a call must not call them
-with several threads: use `spawn`, or `torch.set_num_threads(1)` in the child.
+They use as many threads as torch, but not the threads of torch: a forked process may call them.
 """
 
 from darswin.ops._library import reference_in_use, use_reference

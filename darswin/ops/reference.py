@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.ops._sampling import Sampling
@@ -17,6 +18,8 @@ from darswin.ops.checks import tensor_there
 __all__ = ["polar_sample", "polar_to_image", "window_attention"]
 
 _WORD = 0xFFFFFFFF
+# Up to this side of an image, its coordinates between -1 and 1 are exact to 1e-5 px in float32.
+_MESH_SIDE = 256
 
 
 def philox(seed: Tensor, low: Tensor, high: Tensor) -> list[Tensor]:
@@ -102,7 +105,10 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     if offsets is not None:
         x, y = x + offsets[:, 0], y + offsets[:, 1]
     touches = known & (x > -1) & (x < width) & (y > -1) & (y < height)  # NaN touches nothing
-    x, y = torch.where(touches, x, -1), torch.where(touches, y, -1)
+    x, y = torch.where(touches, x, -2), torch.where(touches, y, -2)
+    # A frame of a camera would become floats as a whole.
+    if image.dtype != torch.uint8 and _meshes(height, width, radii):
+        return laid_out(_sampled(image, x, y), sampling, tokens)
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
     # Index the values in their order in memory, where the channels of a camera frame lie side by
@@ -127,6 +133,22 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner
     return laid_out(out, sampling, tokens)
+
+
+def _meshes(height: int, width: int, like: Tensor) -> bool:
+    """True if `_sampled` is to be used: in the graphs for other runtimes, where it is fast."""
+    small = max(height, width) <= _MESH_SIDE and min(height, width) > 0
+    return torch.compiler.is_exporting() and small and like.dtype == torch.float32
+
+
+def _sampled(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Samples images (B, C, H, W) at points (B or 1, N_r, N_a), px: (B, C, N_r, N_a)."""
+    batch, channels, height, width = image.shape
+    mesh = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), -1)
+    if mesh.shape[0] != 1:
+        return F.grid_sample(image, mesh, align_corners=False)
+    sampled = F.grid_sample(image.flatten(0, 1)[None], mesh, align_corners=False)
+    return sampled[0].unflatten(0, (batch, channels))
 
 
 def laid_out(out: Tensor, sampling: Sampling, tokens: bool) -> Tensor:
@@ -181,6 +203,13 @@ def polar_to_image(
     t = torch.where(beyond, 0, (r - first) / span)
 
     column = azimuth * (sectors / (2 * math.pi)) - 0.5
+    if sectors % 2 == 0 and _meshes(rings, sectors, radii):
+        # The map with the ring across the pole before the first, and the first sector again.
+        maps = torch.cat((x[:, :1].roll(sectors // 2, 2), x), 1).to(radii.dtype)
+        maps = torch.cat((maps, maps[:, :, :1]), 2).permute(0, 3, 1, 2)
+        out = _sampled(maps, column.remainder(sectors), above + t)
+        out = torch.where(known[:, None], out, 0).to(x.dtype)
+        return out.permute(0, 2, 3, 1) if tokens else out
     maps = x.to(radii.dtype).flatten(1, 2)  # bfloat16 is computed in float32
     out = maps.new_zeros(())
     for ring, weight, place in (

@@ -90,6 +90,29 @@ def test_a_frame_begins_when_the_camera_delivers_it(now, taking):
     assert steps == pytest.approx([PACE] * 6)
 
 
+def test_threads_that_still_look_for_work_are_waited_for(now, monkeypatch):
+    """Their CPU time is that of their own candidate, and they take no core from the next one."""
+    busy, until = [0.0], [0.0]
+
+    def sleep(seconds):
+        busy[0] += max(0.0, min(until[0], now[0] + seconds) - now[0])
+        now[0] += seconds
+
+    def run(spins):
+        now[0] += 0.001
+        busy[0] += 0.001
+        until[0] = max(until[0], now[0] + spins)
+
+    monkeypatch.setattr(timing.time, "process_time", lambda: busy[0])
+    monkeypatch.setattr(timing.time, "sleep", sleep)
+    turns = in_turns({"a": lambda: run(0.0), "b": lambda: run(5.3 * PACE)}, 0.5, pace=PACE)
+    assert {round(turn.cpu, 9) for turn in turns["a"]} == {0.001}
+    assert {round(turn.cpu, 9) for turn in turns["b"]} == {round(PACE, 9)}
+    start = now[0]
+    in_turns({"a": lambda: run(1e9)}, PACE, least=1, pace=PACE)  # it never stops
+    assert now[0] - start < 50 * PACE
+
+
 def test_all_numbers_of_threads_take_the_same_turns(taking):
     order = []
 

@@ -266,6 +266,18 @@ def test_onnx_gathers_from_a_frame_before_all_else(shape, tmp_path):
         )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("side", "samplers"), [(64, 2), (320, 1)])
+def test_onnx_samples_small_images_and_maps_with_an_operator_of_the_runtime(
+    side, samplers, tmp_path
+):
+    onnx, path = pytest.importorskip("onnx"), tmp_path / "model.onnx"
+    model = short("darswin_unet_a_nano", **ONE_BLOCK)
+    export_onnx(model, path, torch.rand(1, 3, side, side), SPHERICAL[0], fixed_lens=True)
+    nodes = [node.op_type for node in onnx.load(path).graph.node]
+    assert nodes.count("GridSample") == samplers
+
+
 def sampled(model, images, lens):
     """The inputs of a graph that starts at the tokens, but for the lens, as tensors by name."""
     prepared = model.prepare(lens, model._checked(images).shape[2:])

@@ -385,6 +385,8 @@ def test_an_image_is_solved_as_its_rows_are(name, dtype, bound, monkeypatch):
     for method in ("project", "_angle_at"):
         count(method, getattr(type(lenses), method))
     part = 1.1 * torch.rand(1, 120, 160, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    none = lenses[:0]
+    assert none.unproject(part[:0]).shape == none.project(part[:0]).shape == (0, 120, 160)
     for lens in (lenses, lenses[2]):
         radius = lens._row(lens.r_max.detach(), 3) * part
         theta = lens._row(lens.theta_max.detach(), 3) * part.clamp(max=1)

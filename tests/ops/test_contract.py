@@ -224,6 +224,24 @@ def test_export(name):
     assert torch.equal(program.module()(other), made.run(**other))
 
 
+@every_case
+def test_the_reference_in_graphs_for_other_runtimes(case, monkeypatch):
+    """They have a fast operator that samples, whose coordinates are rounded between -1 and 1."""
+    made, calls = CASES[case](), []
+    with torch.no_grad(), use_reference():
+        expected = made.run(**made.inputs)
+        grid_sample = torch.nn.functional.grid_sample
+        monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+        monkeypatch.setattr(torch.nn.functional, "grid_sample",
+                            lambda *a, **k: (calls.append(a), grid_sample(*a, **k))[1])  # fmt: skip
+        found = made.run(**made.inputs)
+    first = next(iter(made.inputs.values()))
+    sides = {"image": first.shape[2:], "x": first.shape[1:3]}.get(next(iter(made.inputs)), (0,))
+    odd = "x" in made.inputs and first.shape[2] % 2
+    assert len(calls) == (min(sides) > 0 and max(sides) <= 256 and not odd)
+    assert_equal_results(dict(out=found), dict(out=expected), 1e-5)
+
+
 def on_meta(made):
     """The case on another device."""
     made = made.to(torch.device("meta"))

@@ -1,6 +1,5 @@
 """Small tests for past bugs: out-of-bounds reads and writes, crashes and hangs."""
 
-import os
 import subprocess
 import sys
 import textwrap
@@ -115,29 +114,3 @@ def test_any_stride_of_a_single_row_is_as_good():
     odd = image.as_strided(image.shape, (2**62, 2**62, 2**62, 1))
     lens = (torch.rand(1, 4) * 4, torch.rand(8), torch.tensor([[4.0, 0.0]]), None, None)
     assert torch.equal(SAMPLE(odd, *lens, *plain((1, 1))), SAMPLE(image, *lens, *plain((1, 1))))
-
-
-# -- processes -------------------------------------------------------------------------------------
-
-FORKED = """
-    import os, signal, sys, torch
-    from darswin.ops import polar_sample
-    torch.set_num_threads(2)
-    image, radii = torch.rand(4, 3, 32, 32), torch.linspace(0, 15, 16)[None]
-    arguments = (image, radii, torch.linspace(0, 6, 32), torch.full((1, 2), 15.5))
-    expected = polar_sample(*arguments, samples=(4, 4))
-    child = os.fork()
-    if child == 0:
-        signal.alarm(100)
-        torch.set_num_threads(1)
-        os._exit(0 if torch.equal(polar_sample(*arguments, samples=(4, 4)), expected) else 1)
-    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.unsanitized
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_forked_process_works_on_one_thread():
-    done = run(FORKED)
-    assert done.returncode == 0, done.stderr
