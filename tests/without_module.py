@@ -19,6 +19,7 @@ def main() -> None:
         import darswin
         from darswin import ops
 
+        torch.manual_seed(0)
         lens = darswin.lens.Spherical.from_fov(0.4, 2.6, 15.5)
         model = darswin.create_model("darswin_unet_a_nano", num_classes=3)
         images = torch.rand(1, 3, 32, 32)
@@ -42,7 +43,8 @@ def main() -> None:
 
     expected = model.eval()(images, lens)
     program = torch.export.export(model, (images, lens)).module()
-    torch.testing.assert_close(program(images, lens), expected)
+    # A graph rounds differently, by up to 3e-5 here.
+    torch.testing.assert_close(program(images, lens), expected, rtol=1e-4, atol=1e-4)
 
     from darswin.cli.info import facts
 

@@ -169,6 +169,12 @@ def check_pip(arguments: list[str], monkeypatch) -> None:
             assert word in ("--no-build-isolation", "-e", *names), word
 
 
+def check_export(arguments: list[str], monkeypatch) -> None:
+    """The build must read the variable."""
+    (name, value) = arguments[0].split("=")
+    assert f'os.environ.get("{name}") == "{value}"' in (ROOT / "setup.py").read_text()
+
+
 def check_study(arguments: list[str], monkeypatch) -> None:
     """Its own options are read as it reads them, the others as `darswin fit` does."""
     assert arguments[0] in ("studies/study.py", "studies/dense.py")
@@ -232,6 +238,7 @@ PROGRAMS: dict[str, Callable] = {
     "build/cpp/frame": check_frame,
     "cmake": check_cmake,
     "darswin": run_darswin,
+    "export": check_export,
     "make": check_make,
     "pip": check_pip,
     "python": run_program,
