@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from darswin.deploy.own import OwnLinear, OwnNorm, pack
 from darswin.deploy.packed import InDtype, Layer, Own, OwnBlocks, library, refuse_gradients
-from darswin.layers.embed import PatchProjection, PolarPatchEmbed
+from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
 from darswin.layers.transformer import PatchMerging, Stage
@@ -68,6 +69,30 @@ def _(norm: nn.LayerNorm, dtype: torch.dtype) -> nn.Module:
 @fast.register(nn.Conv2d)
 def _(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
     return InDtype(layer, dtype)
+
+
+@fast.register
+def _(embed: PatchEmbed, dtype: torch.dtype) -> nn.Module:
+    return FastPatchEmbed(embed) if dtype == torch.float32 else InDtype(embed, dtype)
+
+
+class FastPatchEmbed(nn.Module):
+    """The embedding of square patches, as a product of our own."""
+
+    def __init__(self, embed: PatchEmbed):
+        super().__init__()
+        conv = embed.proj
+        self.patch = conv.kernel_size[0]
+        self.proj = OwnLinear(pack(conv.weight.flatten(1), conv.bias), conv.out_channels)
+        self.norm = OwnNorm(embed.norm)
+
+    def forward(self, x: Tensor) -> Tensor:
+        refuse_gradients(x)
+        batch, channels, height, width = x.shape
+        side, rows, columns = self.patch, height // self.patch, width // self.patch
+        x = x.float().reshape(batch, channels, rows, side, columns, side)
+        x = x.permute(0, 2, 4, 1, 3, 5).reshape(batch, rows, columns, channels * side * side)
+        return self.norm(self.proj(x))
 
 
 @fast.register

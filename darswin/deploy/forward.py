@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastStage
-from darswin.deploy.own import OwnLinear, OwnNorm, pack
+from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastPatchEmbed, FastStage
+from darswin.deploy.own import OwnLinear, OwnNorm
 from darswin.deploy.packed import InDtype, OwnBlocks, refuse_gradients
 from darswin.deploy.program import AND_GELU, NOTHING, RUN, Program, Slot, Weights
-from darswin.layers.embed import PatchEmbed
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import RAYS, DistanceHead, PixelHead
@@ -258,17 +257,15 @@ def embedded(program: Program, embed: nn.Module, x: Slot) -> Slot:
     """What the view sees → the first map."""
     if isinstance(embed, FastEmbed):
         return program.norm(program.linear(x, own(embed.proj, OwnLinear)), own(embed.norm, OwnNorm))
-    if not (isinstance(embed, InDtype) and isinstance(embed.module, PatchEmbed)):
+    if not isinstance(embed, FastPatchEmbed):
         raise NoProgramError(f"{type(embed).__name__} is no instruction of a network's program")
-    conv, (channels, height, width) = embed.module.proj, x.shape
-    side = conv.kernel_size[0]
+    (channels, height, width), side = x.shape, embed.patch
     rows, columns = height // side, width // side
     patches = program.permuted(
         x, (channels, rows, side, columns, side), (1, 3, 0, 2, 4), rows, columns,
         channels * side * side,
     )  # fmt: skip
-    layer = OwnLinear(pack(conv.weight.flatten(1), conv.bias), conv.out_channels)
-    return program.norm(program.linear(patches, layer), OwnNorm(embed.module.norm))
+    return program.norm(program.linear(patches, embed.proj), embed.norm)
 
 
 def stage(program: Program, layer: nn.Module, x: Slot, tables: Sequence[Slot]) -> Slot:
