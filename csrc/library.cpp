@@ -58,6 +58,12 @@ namespace {
 [[maybe_unused]] const auto as_torch =
     darswin::thread_setting = [] { return static_cast<int64_t>(torch::stable::get_num_threads()); };
 
+[[maybe_unused]] const auto with_torch = darswin::torch_ranges =
+    [](int64_t count, int64_t threads, darswin::RangeBody body, void* context) {
+      torch::stable::parallel_for(0, count, (count + threads - 1) / threads,
+                                  [&](int64_t begin, int64_t end) { body(context, begin, end); });
+    };
+
 }  // namespace
 
 // Facts about the module, which darswin/ops/_module.py reads.
@@ -87,6 +93,9 @@ FACT bool darswin_allow_fours(bool allowed) {
   darswin::allow_fours(allowed);
   return darswin::has_fours();
 }
+
+// Says whether calls of this thread use the threads of torch, as the backwards do by themselves.
+FACT void darswin_use_torch_threads(bool use) { darswin::TorchThreads::set(use); }
 
 #if defined(__clang__)
 #  define COMPILER "clang++ " __clang_version__

@@ -49,6 +49,7 @@ Tensor forward(PolarCall<T>& call, bool tokens) {
 template <typename T>
 auto backward(PolarCall<T>& call, bool tokens, Tensor grad, bool image_grad, bool lens_grad,
               bool offsets_grad) {
+  const TorchThreads in_training;
   choose_layout(call.args, tokens);
   grad = checked_gradient(grad, output_sizes(call), call.output_type(), "polar_sample");
   call.args.grad_out = grad.const_data_ptr();

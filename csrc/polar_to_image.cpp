@@ -227,6 +227,7 @@ std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
 template <typename T>
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(ToImageCall<T>&& call, Tensor grad,
                                                             bool x_grad, bool lens_grad) {
+  const TorchThreads in_training;
   grad = checked_gradient(grad, call.output_sizes(), call.x.scalar_type(), kName);
   call.args.grad_out = pointer<T>(grad);
   std::vector<Tensor> lens(4, no_gradient(type_of<Arithmetic<T>>()));

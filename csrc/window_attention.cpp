@@ -37,6 +37,7 @@ int64_t chunk_size(const WindowAttentionArgs<T>& args) {
 
 template <typename T>
 std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
+  const TorchThreads in_training;
   auto& args = call.args;
   grad_out = checked_gradient(grad_out, call.output_sizes(), call.qkv.scalar_type(), kAttention);
   const Tensor grad_qkv = new_tensor(call.qkv.sizes(), call.qkv.scalar_type());

@@ -20,6 +20,7 @@
 #include <new>
 #include <system_error>
 #include <thread>
+#include <utility>
 
 namespace darswin {
 namespace {
@@ -107,6 +108,7 @@ const int64_t cores = std::thread::hardware_concurrency();
 [[maybe_unused]] const int at_fork = pthread_atfork(nullptr, nullptr, [] { new (&pool) Pool; });
 
 thread_local int64_t limit = 0;  // 0: none
+thread_local bool use_torch = false;
 
 void pause() {
 #if defined(__x86_64__)
@@ -224,7 +226,14 @@ int64_t num_threads() { return limit > 0 ? limit : thread_setting(); }
 ThreadLimit::ThreadLimit(int64_t threads) : before(limit) { limit = threads; }
 ThreadLimit::~ThreadLimit() { limit = before; }
 
+void (*torch_ranges)(int64_t, int64_t, RangeBody, void*) = nullptr;
+
+bool TorchThreads::set(bool use) { return std::exchange(use_torch, use); }
+TorchThreads::TorchThreads(bool use) : before(set(use)) {}
+TorchThreads::~TorchThreads() { set(before); }
+
 void run_ranges(int64_t count, Threads threads, RangeBody body, void* context) {
+  if (use_torch && torch_ranges != nullptr) return torch_ranges(count, threads, body, context);
   Job* job = pool.jobs;
   while (job->taken.exchange(true, std::memory_order_acquire)) {
     if (++job == pool.jobs + kJobs) return body(context, 0, count);

@@ -119,8 +119,27 @@ inline double sampling_microseconds(double count, int64_t channels) {
   return count * static_cast<double>(channels + 4) / kPerMicrosecond;
 }
 
-// Calls body(context, begin, end) as parallel_ranges does.
 using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
+
+// Calls of this thread use the threads of torch, for the lifetime of this object. In training,
+// torch's own operators come before and after ours. Their helper threads stay awake for some
+// milliseconds, and two teams that are awake would compete for the cores.
+class TorchThreads {
+ public:
+  explicit TorchThreads(bool use = true);
+  ~TorchThreads();
+  TorchThreads(const TorchThreads&) = delete;
+
+  static bool set(bool use);  // returns what was set before
+
+ private:
+  bool before;
+};
+
+// Runs ranges on the threads of torch. libdarswin.so sets it; null without torch.
+extern void (*torch_ranges)(int64_t count, int64_t threads, RangeBody body, void* context);
+
+// Calls body(context, begin, end) as parallel_ranges does.
 void run_ranges(int64_t count, Threads threads, RangeBody body, void* context);
 
 // Calls body(begin, end) on contiguous ranges that cover [0, count), in up to so many threads. A

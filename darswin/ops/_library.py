@@ -163,8 +163,12 @@ def _register_autograd(operator: OpOverload, title: str, gradients: Callable) ->
     def record(ctx, *arguments):
         ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in arguments])
         ctx.others = [None if isinstance(x, Tensor) else x for x in arguments]
-        with torch._C._AutoDispatchBelowAutograd():
-            return operator(*arguments)
+        _module.use_torch_threads(True)
+        try:
+            with torch._C._AutoDispatchBelowAutograd():
+                return operator(*arguments)
+        finally:
+            _module.use_torch_threads(False)
 
     methods = {"forward": staticmethod(record), "backward": staticmethod(gradients)}
     name = operator._schema.name.removeprefix("darswin::")

@@ -45,6 +45,8 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_use_torch_threads.argtypes = [ctypes.c_bool]
+    module.darswin_use_torch_threads.restype = None
     module.darswin_allow_fours.argtypes = [ctypes.c_bool]
     module.darswin_allow_fours.restype = ctypes.c_bool
     return module
@@ -87,6 +89,12 @@ def allow_fours(allowed: bool) -> bool:
     they are allowed.
     """
     return False if _loaded is None else _loaded.darswin_allow_fours(allowed)
+
+
+def use_torch_threads(use: bool) -> None:
+    """Says whether calls of this thread use the threads of torch, as they should in training."""
+    if _loaded is not None:
+        _loaded.darswin_use_torch_threads(use)
 
 
 def build_info() -> dict[str, str | int]:
