@@ -3,7 +3,8 @@
 On the CPU they run compiled code. On other devices, within `use_reference`, and where the compiled
 module cannot be loaded, they run the PyTorch reference.
 
-They use as many threads as torch, but not the threads of torch: a forked process may call them.
+They use as many threads as torch. Outside of training these are not the threads of torch, and a
+forked process may call them.
 """
 
 from darswin.ops._library import reference_in_use, use_reference
