@@ -50,8 +50,8 @@ def _brackets(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Below and above the x of `inverse`, and a first guess of it."""
     high = torch.broadcast_tensors(end, value)[0]
-    few = high.numel() <= 4 * _TABLE * end.numel()
-    if few or not eager or end.dim() == 0:
+    # The sizes come last: a graph would get a limit of them.
+    if not eager or end.dim() == 0 or high.numel() <= 4 * _TABLE * end.numel():
         return torch.zeros_like(high), high, high * (value / function(end)).clamp(0, 1)
     # With one end for many values, as for the pixels of an image: from a table.
     steps = torch.linspace(0, 1, _TABLE, dtype=end.dtype, device=end.device)
