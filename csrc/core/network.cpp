@@ -13,7 +13,6 @@
 namespace darswin {
 namespace {
 
-constexpr int64_t kMost = int64_t{1} << 40;  // of any number in a program
 // The count of arguments of each opcode, in its order.
 constexpr std::array<int64_t, 12> kArguments = {9, 5, 23, 19, 2, 4, 1, 8, 7, 8, 8, 2};
 void require(bool condition, const char* what) {
@@ -24,8 +23,8 @@ void require(bool condition, const char* what) {
 int64_t product(std::initializer_list<int64_t> sizes) {
   int64_t result = 1;
   for (const int64_t size : sizes) {
-    require(size >= 0 && size <= kMost, "has a size out of range");
-    require(!__builtin_mul_overflow(result, size, &result) && result <= kMost,
+    require(size >= 0 && size <= kMostNumbers, "has a size out of range");
+    require(!__builtin_mul_overflow(result, size, &result) && result <= kMostNumbers,
             "has sizes that are too large");
   }
   return result;
@@ -42,7 +41,7 @@ struct Reader {
   }
   int64_t size() {
     const int64_t value = next();
-    require(value >= 0 && value <= kMost, "has a size out of range");
+    require(value >= 0 && value <= kMostNumbers, "has a size out of range");
     return value;
   }
   std::vector<int64_t> sizes() {
@@ -80,7 +79,7 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
                 arguments == kArguments[opcode] &&
                 arguments <= static_cast<int64_t>(program.size() - reader.at),
             "has an unknown instruction: it may come from a newer version of darswin");
-    steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at], arguments));
+    steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at]));
     reader.at += arguments;
   }
 }
@@ -145,7 +144,7 @@ Block Network::block_of(const int64_t* a) const {
   return block;
 }
 
-Network::Step Network::checked(Opcode opcode, const int64_t* a, int64_t) const {
+Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
   Step step{opcode, a};
   const auto apart = [&] { require(a[0] != a[1], "writes what it still reads"); };
   switch (opcode) {

@@ -35,6 +35,7 @@ enum class Opcode : int64_t {
 };
 
 constexpr int64_t kCopyAxes = 5;
+constexpr int64_t kMostNumbers = int64_t{1} << 40;  // of a program, and of the buffers of a run
 
 // The numbers of an input: (rows, numbers of one image) with a row for each image or one for all.
 struct Input {
@@ -72,7 +73,7 @@ class Network {
   };
   struct Run;
 
-  Step checked(Opcode opcode, const int64_t* arguments, int64_t count) const;
+  Step checked(Opcode opcode, const int64_t* arguments) const;
   Layer layer_at(int64_t offset, int64_t depth, int64_t columns, int64_t is_quantized) const;
   Norm norm_at(int64_t offset, int64_t dim) const;
   Block block_of(const int64_t* arguments) const;

@@ -116,13 +116,17 @@ void FrameNetwork::check(const Frame& frame) const {
 
 void FrameNetwork::run(const Frame& frame, float* const* outputs) const {
   std::vector<Input> given = inputs;
-  std::unique_ptr<float[]> read[2];  // not initialized: all of it is written
-  for (int64_t k = 0; k < (reads_frame ? 2 : 1); ++k) {
-    read[k] = std::make_unique_for_overwrite<float[]>(network->input_numbers(k));
-    given[k].data = read[k].get();
+  const int64_t sampled = round_up(network->input_numbers(0), 16);
+  const int64_t whole = reads_frame ? network->input_numbers(1) : 0;
+  // Fresh pages would cost more than the sampling. The network uses kinds 1 and 2.
+  const ThreadMemoryOf<3> memory((sampled + whole) * sizeof(float));
+  auto* numbers = static_cast<float*>(memory.get());
+  given[0].data = numbers;
+  sampler->sample(frame, numbers);
+  if (reads_frame) {
+    given[1].data = numbers + sampled;
+    sampler->normalize(frame, numbers + sampled);
   }
-  sampler->sample(frame, read[0].get());
-  if (reads_frame) sampler->normalize(frame, read[1].get());
   network->run(1, given.data(), outputs);
   if (how == Finish::probabilities) softmax(outputs[0], output_shape(0)[0]);
 }

@@ -309,8 +309,7 @@ void Network::run(int64_t batch, const Input* given, float* const* results) cons
   if (batch == 0) return;
   int64_t total = 1;
   for (const int64_t count : buffers) total += count;
-  constexpr int64_t kMost = int64_t{1} << 40;
-  if (batch > kMost / total) throw std::invalid_argument("the batch is too large");
+  if (batch > kMostNumbers / total) throw std::invalid_argument("the batch is too large");
   const int64_t slots = input_count() + static_cast<int64_t>(buffers.size());
   Run run{*this, batch, std::vector<const float*>(slots), std::vector<float*>(slots),
           std::vector<int64_t>(slots, batch)};

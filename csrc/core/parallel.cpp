@@ -229,8 +229,6 @@ ThreadLimit::~ThreadLimit() { limit = before; }
 void (*torch_ranges)(int64_t, int64_t, RangeBody, void*) = nullptr;
 
 bool TorchThreads::set(bool use) { return std::exchange(use_torch, use); }
-TorchThreads::TorchThreads(bool use) : before(set(use)) {}
-TorchThreads::~TorchThreads() { set(before); }
 
 void run_ranges(int64_t count, Threads threads, RangeBody body, void* context) {
   if (use_torch && torch_ranges != nullptr) return torch_ranges(count, threads, body, context);

@@ -126,8 +126,8 @@ using RangeBody = void (*)(void* context, int64_t begin, int64_t end);
 // milliseconds, and two teams that are awake would compete for the cores.
 class TorchThreads {
  public:
-  explicit TorchThreads(bool use = true);
-  ~TorchThreads();
+  TorchThreads() : before(set(true)) {}
+  ~TorchThreads() { set(before); }
   TorchThreads(const TorchThreads&) = delete;
 
   static bool set(bool use);  // returns what was set before

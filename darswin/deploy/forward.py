@@ -65,10 +65,7 @@ class _UnetRun:
         tables, places = _tables(program, unet), _places(program, unet)
         x = carried(program, unet, seen, tables, places)
         if unet.view.in_pixels:
-            x = program.resized(x, seen.shape[1:])
-            rays = _rays(program, unet, seen.shape[1:])
-            pixels = program.channels_last(seen, *rays) if unet.head.skip_width else None
-            x = refined(program, unet.head, x, pixels)
+            x = _refined_view(program, unet, x, seen, _rays(program, unet, seen.shape[1:]))
         program.output(x)
         self.words = program.words()
         self.heads: dict[Pair, list[int]] = {}  # the program of the head, by the size of the images
@@ -148,15 +145,11 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
         rays = _rays(program, model, of_rays)
         x = carried(program, model, seen, tables, places)
         if model.view.in_pixels:
-            x = program.resized(x, seen.shape[1:])
-            pixels = program.channels_last(seen, *rays) if model.head.skip_width else None
-            x = refined(program, model.head, x, pixels)
+            x = _refined_view(program, model, x, seen, rays)
         x = _back(program, model.view, x, prepared, constants)
         if reads_frame:
-            maps = [frame] + [
-                program.permuted(r, r.shape, (1, 2, 0), *r.shape[1:], RAYS) for r in rays
-            ]
-            x = refined(program, model.head, x, program.joined(*maps))
+            pixels = program.joined(frame, *(program.channels_last(of) for of in rays))
+            x = refined(program, model.head, x, pixels)
         if isinstance(model.head, DistanceHead):
             x = program.distance(x, model.head.typical_distance)
         results = [program.channels_first(x)]
@@ -165,6 +158,13 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
     constants = [one.detach().float()[0].contiguous() for one in constants]
     classifier = isinstance(model, Encoder) and model.num_classes > 0
     return FrameProgram(program.words(), program.weights.words, constants, reads_frame, classifier)
+
+
+def _refined_view(program: Program, unet: Unet, x: Slot, seen: Slot, rays: Sequence[Slot]) -> Slot:
+    """The carried channels → the logits of the pixels of the view."""
+    x = program.resized(x, seen.shape[1:])
+    pixels = program.channels_last(seen, *rays) if unet.head.skip_width else None
+    return refined(program, unet.head, x, pixels)
 
 
 def _back(
