@@ -79,6 +79,10 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
                 arguments == kArguments[opcode] &&
                 arguments <= static_cast<int64_t>(program.size() - reader.at),
             "has an unknown instruction: it may come from a newer version of darswin");
+    for (int64_t k = 0; k < arguments; ++k) {  // then no sum or product of two overflows
+      const int64_t argument = program[reader.at + k];
+      require(argument >= -kMostNumbers && argument <= kMostNumbers, "has a number out of range");
+    }
     steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at]));
     reader.at += arguments;
   }

@@ -159,16 +159,17 @@ def _register_autograd(operator: OpOverload, title: str, gradients: Callable) ->
     """
     kinds = [str(argument.type) for argument in operator._schema.arguments]
     tensors = [index for index, kind in enumerate(kinds) if "Tensor" in kind]
+    use_torch_threads = _module.torch_threads_switch()
 
     def record(ctx, *arguments):
         ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in arguments])
         ctx.others = [None if isinstance(x, Tensor) else x for x in arguments]
-        _module.use_torch_threads(True)
+        use_torch_threads(True)
         try:
             with torch._C._AutoDispatchBelowAutograd():
                 return operator(*arguments)
         finally:
-            _module.use_torch_threads(False)
+            use_torch_threads(False)
 
     methods = {"forward": staticmethod(record), "backward": staticmethod(gradients)}
     name = operator._schema.name.removeprefix("darswin::")

@@ -8,6 +8,7 @@ import ctypes
 import json
 import multiprocessing
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -91,10 +92,11 @@ def allow_fours(allowed: bool) -> bool:
     return False if _loaded is None else _loaded.darswin_allow_fours(allowed)
 
 
-def use_torch_threads(use: bool) -> None:
-    """Says whether calls of this thread use the threads of torch, as they should in training."""
-    if _loaded is not None:
-        _loaded.darswin_use_torch_threads(use)
+def torch_threads_switch() -> Callable[[bool], None]:
+    """The module's own function that says whether calls of this thread use the threads of torch, as
+    they should in training. It is called in each recorded call, where Python would take longer."""
+    assert _loaded is not None
+    return _loaded.darswin_use_torch_threads
 
 
 def build_info() -> dict[str, str | int]:

@@ -162,6 +162,7 @@ def test_helpers_without_work_sleep():
 
 
 @pytest.mark.slow
+@pytest.mark.unsanitized  # a program cannot have two sanitizers
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 def test_thread_sanitizer_finds_no_race_in_the_pool(tmp_path):
     program = tmp_path / "pool"
