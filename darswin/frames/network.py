@@ -12,7 +12,6 @@ from darswin.frames.plans import check_name, check_size, plan_of, write_arrays
 if TYPE_CHECKING:
     from darswin.lens import Lens
     from darswin.models.base import Model
-    from darswin.views.base import PerChannel
 
 _VERSION = (1, 0)  # csrc/core/network_file.h describes the file
 
@@ -63,8 +62,8 @@ def export(
     path: str | os.PathLike,
     *,
     labels: Sequence[str] | None = None,
-    mean: "PerChannel | None" = None,
-    std: "PerChannel | None" = None,
+    mean: float | Sequence[float] | None = None,
+    std: float | Sequence[float] | None = None,
 ) -> None:
     """Writes a network for the frames of one camera, which `Network` runs without torch.
 
