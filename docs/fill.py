@@ -83,12 +83,16 @@ def frame_line(timings: Sequence[Timing]) -> str:
     parts[:2] = [part.replace("the ", "") for part in parts[:2]]
     first, *others = parts
     in_int8 = [t for t in timings if (t.name, t.batch, t.threads) == ("float32", 1, 1)]
-    int8 = [f"`{t.subject}` is {t.ratio:.1f} times" for t in in_int8]
+    wide, narrow = (
+        [f"`{t.subject}` is {t.ratio:.1f} times" for t in in_int8 if t.mode.endswith(end)]
+        for end in ("fixed lens", "avx2")
+    )
     how = "at a camera's pace" if frames[0].paced else "in a loop"
     return (
         f"For one frame on one core, {how}, these models are {first}.\n"
         f"They are {' and '.join(others)}.\n"
-        f"In a loop, {' and '.join(int8)} as fast in int8 as in float32."
+        f"In a loop, {' and '.join(wide)} as fast in int8 as in float32.\n"
+        f"On the tier of AVX2, {' and '.join(narrow)} as fast."
     )
 
 
