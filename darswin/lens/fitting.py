@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import torch
@@ -111,6 +111,30 @@ def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[
         yield start
 
 
+class Packing:
+    """Parameters of one lens as one vector: names and shapes are those of tensors (1, ...). `low`
+    and `high` bound its numbers in a fit."""
+
+    def __init__(self, model: type[Lens], tensors: Mapping[str, Tensor]):
+        self.shapes = {name: tensor.shape for name, tensor in tensors.items()}
+        declared = {name: model.declared[name] for name in tensors}
+        bounds = {name: p.bounds or (p.low, p.high) for name, p in declared.items()}
+        self.low, self.high = (
+            self.vector({n: t.new_full(t.shape, bounds[n][end]) for n, t in tensors.items()})
+            for end in (0, 1)
+        )
+
+    def vector(self, tensors: Mapping[str, Tensor]) -> Tensor:
+        """The numbers of the tensors, one after the other."""
+        return torch.cat([tensors[name].flatten() for name in self.shapes])
+
+    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
+        """The inverse of `vector`."""
+        pieces = vector.split([shape.numel() for shape in self.shapes.values()])
+        named = zip(self.shapes.items(), pieces, strict=True)
+        return {name: piece.reshape(shape) for (name, shape), piece in named}
+
+
 def _least_squares(
     model: type[Lens],
     start: dict[str, Tensor],
@@ -121,20 +145,11 @@ def _least_squares(
 ) -> tuple[Lens, float]:
     """The closest lens within bounds by the Levenberg–Marquardt method, and its mean squared
     distance, which is infinite if no lens was found."""
-    names = list(start)
-    shapes = [start[name].shape for name in names]
-    sizes = [shape.numel() for shape in shapes]
-    declared = [model.declared[name] for name in names]
-    bounds = [p.bounds or (p.low, p.high) for p in declared]
-    low, high = (
-        torch.cat([theta.new_full((s,), b[end]) for b, s in zip(bounds, sizes, strict=True)])
-        for end in (0, 1)
-    )
+    packing = Packing(model, start)
+    low, high = packing.low, packing.high
 
     def lens_of(vector: Tensor) -> Lens:
-        pieces = zip(names, vector.split(sizes), shapes, strict=True)
-        tensors = {name: piece.reshape(shape) for name, piece, shape in pieces}
-        return model._from_tensors(tensors | {"theta_max": theta_max})
+        return model._from_tensors(packing.tensors(vector) | {"theta_max": theta_max})
 
     def miss(vector: Tensor) -> Tensor:
         return (lens_of(vector)._flat(theta, direction) - goal).flatten()
@@ -145,7 +160,7 @@ def _least_squares(
         value = (lens._flat(theta, direction) - goal).square().mean().item()
         return value if rises and value >= 0 else math.inf
 
-    vector = torch.cat([start[name].flatten() for name in names]).clamp(low, high)
+    vector = packing.vector(start).clamp(low, high)
     cost, damping = cost_of(vector), 1e-3
     if not math.isfinite(cost):
         return lens_of(vector), math.inf
