@@ -29,6 +29,11 @@ class Start(NamedTuple):
     depth: Tensor
     error: Tensor
 
+    @property
+    def fits(self) -> Tensor:
+        """(P,) bool: the pictures that miss it by no more than others."""
+        return self.error <= (10 * self.error.median()).clamp(min=2.0)
+
     def rays(self, corners: Tensor) -> Tensor:
         """(..., 3): unit vectors towards corners (..., 2)."""
         flat = corners - self.center
@@ -59,9 +64,9 @@ def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) 
         center = around[((counts * error.log()).sum(1) + prior).argmin()]
         step, line = step / 3, torch.arange(-3, 4, dtype=corners.dtype)
     plane, error = (x[0] for x in misses(center[None]))
-    fits = error <= (10 * error.median()).clamp(min=2.0)
-    depth = _depth(length_of(corners - center), seen & fits[:, None], plane, board)
-    return Start(center, depth, error)
+    found = Start(center, center, error)
+    counts = seen & found.fits[:, None]
+    return found._replace(depth=_depth(length_of(corners - center), counts, plane, board))
 
 
 def _in_plane(flat: Tensor, seen: Tensor, board: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,9 @@ LOST = 1e4  # px: the distance of a corner whose ray the lens does not see
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
 RAYLEIGH = math.sqrt(2 * math.log(2))  # the median of a corner's distance, in standard deviations
 FINEST = 1e-4  # px: the least scale
+# The places of numbers that stay as they are.
+HELD = {(OCam, "coefficients"): (1,), (OCamInverse, "coefficients"): (0,),
+        (Tabulated, "radii"): (0,)}  # fmt: skip
 
 
 class Free:
@@ -39,11 +42,10 @@ class Free:
         for name, tensor in tensors.items():
             count = tensor[0].numel()
             self.names += [f"{name}[{k}]" if tensor.dim() > 1 else name for k in range(count)]
-            held = {("OCam", "coefficients"): [1], ("OCamInverse", "coefficients"): [0],
-                    ("Tabulated", "radii"): [0]}.get((self.model.__name__, name), [])  # fmt: skip
-            if name == "affine":
-                held = [0, 1, 2]
-            free += [name != "angles" and k not in held for k in range(count)]
+            held = HELD.get((self.model, name), ())
+            if name in ("angles", "affine"):  # of an affine, the ratio of the sides is free
+                held = range(count - (name == "affine"))
+            free += [k not in held for k in range(count)]
         self.free = torch.tensor(free)
         self.names = [name for name, is_free in zip(self.names, free, strict=True) if is_free]
         start = self.packing.vector(tensors)
@@ -68,6 +70,10 @@ class Free:
             return self.model(**self.tensors(vector))
         except ValueError:
             return None
+
+    def held(self, vector: Tensor, side: Tensor) -> Tensor:
+        """(n,) bool: the numbers that are at a bound and would leave it, along `side`."""
+        return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
 
     def pixels(self, vector: Tensor, points: Tensor, theta_max: Tensor) -> Tensor:
         """Where the lens of a vector sees points (..., 3); differentiable."""
@@ -97,35 +103,84 @@ class Views:
 
 
 class Equations(NamedTuple):
-    """The normal equations of one step: of the lens (n, n), of poses (P, 6, 6), and between them
-    (P, n, 6); and the right sides."""
+    """The normal equations of one step, for each picture: of the lens (P, n, n), of the pose
+    (P, 6, 6), and between them (P, n, 6); the right sides (P, n) and (P, 6); and the derivatives of
+    the pixels, (P, K, 2, n + 6)."""
 
     lens: Tensor
     poses: Tensor
     mixed: Tensor
     lens_side: Tensor
     pose_side: Tensor
-    slopes: Tensor  # (P, K, 2, n + 6): the derivatives of pixels
+    slopes: Tensor
 
-    def step(self, damping: float, held: Tensor) -> tuple[Tensor, Tensor]:
-        """The step of the lens (n,), 0 where `held`, and those of the poses (P, 6)."""
-        scale = 1 / self.lens.diagonal().clamp(min=1e-30).sqrt() * ~held
+    def reduced(self, damping: float, held: Tensor) -> "Reduced":
+        """The equations of the lens alone; numbers of the lens that are `held` do not move."""
+        total = self.lens.sum(0).diagonal().clamp(min=1e-30)
+        scale = ~held / total.sqrt()
         size = 1 / self.poses.diagonal(dim1=1, dim2=2).clamp(min=1e-30).sqrt()
-        eye, six = torch.eye(len(scale)).to(scale), torch.eye(6).to(scale)
-        poses = size[:, :, None] * self.poses * size[:, None] + damping * six
+        poses = size[:, :, None] * self.poses * size[:, None]
         mixed = scale[:, None] * self.mixed * size[:, None]
         # A picture without corners has no equations.
-        factor, _ = torch.linalg.cholesky_ex(poses + 1e-14 * six)
-        solved = torch.cholesky_solve(mixed.mT, factor)  # (P, 6, n)
-        sides = size * self.pose_side
-        schur = scale[:, None] * self.lens * scale + damping * eye - (mixed @ solved).sum(0)
-        side = scale * self.lens_side - (mixed @ torch.cholesky_solve(sides[..., None], factor))[
-            ..., 0
-        ].sum(0)
-        schur = schur + torch.diag(held.to(scale)) + 1e-14 * eye
-        lens_step = torch.linalg.lstsq(schur, side[:, None]).solution[:, 0]
-        rest = sides[..., None] - (mixed.mT @ lens_step)[..., None]
-        return scale * lens_step, size * torch.cholesky_solve(rest, factor)[..., 0]
+        poses = poses + (damping + 1e-14) * torch.eye(6).to(scale)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(poses)[0])
+        back = mixed @ inverse
+        matrices = scale[:, None] * self.lens * scale - back @ mixed.mT
+        sides = self.pose_side * size
+        lens_sides = scale * self.lens_side - (back @ sides[..., None])[..., 0]
+        return Reduced(scale, size, inverse, back, matrices, sides, lens_sides)
+
+
+class Reduced(NamedTuple):
+    """Each picture's equations of the lens after its pose is eliminated, in units in which the
+    diagonals are 1: factors of the lens (n,) and of poses (P, 6), the inverses (P, 6, 6) of the
+    poses' matrices, and the products (P, n, 6) with them; matrices (P, n, n); right sides."""
+
+    scale: Tensor
+    size: Tensor
+    inverse: Tensor
+    back: Tensor
+    matrices: Tensor
+    pose_sides: Tensor
+    sides: Tensor
+
+    def step(self, damping: float) -> tuple[Tensor, Tensor]:
+        """The steps of the lens (n,) and of the poses (P, 6)."""
+        eye = torch.eye(len(self.scale)).to(self.scale)
+        step = _inverse(self.matrices.sum(0) + damping * eye) @ self.sides.sum(0)
+        return self.scale * step, self.poses(step)
+
+    def poses(self, steps: Tensor) -> Tensor:
+        """(P, 6): the steps of the poses that follow from that of the lens, (n,) or (P, n)."""
+        own = (self.inverse @ self.pose_sides[..., None])[..., 0]
+        steps = steps.expand(len(own), -1)
+        return self.size * (own - (self.back.mT @ steps[..., None])[..., 0])
+
+    def without(self) -> tuple[Tensor, Tensor]:
+        """The steps of the lens, (P, n), and of each pose, (P, 6), if its picture is left out of
+        the lens."""
+        rest = _inverse(self.matrices.sum(0) - self.matrices)
+        steps = (rest @ (self.sides.sum(0) - self.sides)[..., None])[..., 0]
+        return self.scale * steps, self.poses(steps)
+
+    def covariance(self, used: Tensor) -> Tensor:
+        """(n + 3, n + 3) of the lens and of the mean rotation of the poses that are `used`, for
+        corners with a standard deviation of 1 px."""
+        lens = _inverse(self.matrices.sum(0))
+        turned = self.size[:, :3, None] * self.back.mT[:, :3]
+        follow = -turned[used].mean(0)
+        own = self.size[:, :3, None] * self.inverse[:, :3, :3] * self.size[:, None, :3]
+        both = torch.cat((torch.diag(self.scale), follow))
+        joint = both @ lens @ both.T
+        joint[-3:, -3:] += own[used].sum(0) / used.sum() ** 2
+        return joint
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """The inverse of symmetric matrices (..., n, n); what is not determined is very large."""
+    values, vectors = torch.linalg.eigh(matrix)
+    values = values.clamp(min=1e-14 * values[..., -1:].clamp(min=1e-14))
+    return (vectors / values[..., None, :]) @ vectors.mT
 
 
 def equations(
@@ -159,8 +214,8 @@ def equations(
     normal = rows.flatten(1, 2).mT @ flat
     side = -(rows * miss[..., None]).sum((1, 2))
     return Equations(
-        normal[:, :count, :count].sum(0), normal[:, count:, count:], normal[:, :count, count:],
-        side[:, :count].sum(0), side[:, count:], slopes,
+        normal[:, :count, :count], normal[:, count:, count:], normal[:, :count, count:],
+        side[:, :count], side[:, count:], slopes,
     )  # fmt: skip
 
 
@@ -178,10 +233,8 @@ class Refined(NamedTuple):
 
 def turns(vectors: Tensor) -> Tensor:
     """(P, 3, 3): rotations by vectors (P, 3), rad."""
-    eye = torch.eye(3).to(vectors)
-    return torch.matrix_exp(
-        torch.linalg.cross(*torch.broadcast_tensors(vectors[:, None], eye)).mT
-    ).mT.mT
+    axes = torch.broadcast_tensors(vectors[:, None], torch.eye(3).to(vectors))
+    return torch.matrix_exp(torch.linalg.cross(*axes).mT)
 
 
 def refine(
@@ -200,14 +253,12 @@ def refine(
         spread = distance.quantile(part).item() / typical
         scale = max(min(scale, SCALE * spread), FINEST)
         cost = _cost(miss, views.seen, scale)
-        weights = _weights(miss, views.seen, scale)
+        weights = weights_of(miss, views.seen, scale)
         normal = equations(views, free, vector, lens, rotations, translations, weights)
-        low = (vector <= free.low) & (normal.lens_side < 0)
-        held = low | ((vector >= free.high) & (normal.lens_side > 0))
-        held = held if lens_moves else torch.ones_like(held)
+        held = free.held(vector, normal.lens_side.sum(0)) | (not lens_moves)
         before = cost
         while damping < 1e10:
-            step, moves = normal.step(damping, held)
+            step, moves = normal.reduced(damping, held).step(damping)
             trial = (vector + step).clamp(free.low, free.high)
             trial_lens = free.lens(trial) if lens_moves else lens
             poses = turns(moves[:, :3]) @ rotations, translations + moves[:, 3:]
@@ -225,19 +276,14 @@ def refine(
                 break
             fine, damping, still = True, 1e-4, 0
     return Refined(
-        vector, lens, rotations, translations, miss, _weights(miss, views.seen, scale), scale
+        vector, lens, rotations, translations, miss, weights_of(miss, views.seen, scale), scale
     )
 
 
-def _weights(miss: Tensor, seen: Tensor, scale: float) -> Tensor:
+def weights_of(miss: Tensor, seen: Tensor, scale: float) -> Tensor:
     return seen / (1 + miss.square().sum(-1) / scale**2)
 
 
 def _cost(miss: Tensor, seen: Tensor, scale: float) -> float:
     loss = (miss.square().sum(-1) / scale**2).log1p()
     return torch.where(seen, loss, 0.0).sum().item()
-
-
-# Other models have no number that is held.
-HELD = {OCam: {"coefficients": [1]}, OCamInverse: {"coefficients": [0]},
-        Tabulated: {"radii": [0]}}  # fmt: skip

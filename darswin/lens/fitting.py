@@ -15,6 +15,7 @@ from darswin.lens.solve import direction_of
 
 # The grid of rays that are compared.
 RINGS, SPOKES = 200, 16
+ROUNDS = 200
 
 
 class Fit(NamedTuple):
@@ -54,7 +55,7 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         return Fit(curves, largest_distance(curves, lens))
     terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
-    found = cat([_fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
+    found = cat([fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
     fitted = model(**found | {name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
@@ -74,7 +75,9 @@ def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
     return theta[..., None], direction_of(azimuth)[None, None]
 
 
-def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
+def fit_one(model: type[Lens], lens: Lens, terms: int, rounds: int = ROUNDS) -> Lens:
+    """`fit` of one lens in float64, without the parameters that all lenses have but theta_max, in
+    at most `rounds` steps from each start."""
     # A radial lens needs one azimuth only.
     aside = not lens.is_radial and "tangential" in model.optional
     theta, direction = _rays(lens, RINGS, SPOKES if aside else 1)
@@ -85,7 +88,7 @@ def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
     found = (
-        _least_squares(model, start, lens.theta_max, theta, direction, goal)
+        _least_squares(model, start, lens.theta_max, theta, direction, goal, rounds)
         for start in _starts(model, lens, terms, aside)
     )
     best, cost = min(found, key=lambda pair: pair[1])
@@ -142,6 +145,7 @@ def _least_squares(
     theta: Tensor,
     direction: Tensor,
     goal: Tensor,
+    rounds: int,
 ) -> tuple[Lens, float]:
     """The closest lens within bounds by the Levenberg–Marquardt method, and its mean squared
     distance, which is infinite if no lens was found."""
@@ -165,7 +169,7 @@ def _least_squares(
     if not math.isfinite(cost):
         return lens_of(vector), math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
-    for _ in range(200):
+    for _ in range(rounds):
         columns = [torch.func.jvp(miss, (vector,), (axis,)) for axis in axes]
         error, slopes = columns[0][0], torch.stack([column[1] for column in columns], 1)
         scale = slopes.norm(dim=0).clamp(min=1e-30)

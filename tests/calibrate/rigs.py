@@ -59,10 +59,10 @@ def true_lens(
 
 def turn(vector: Tensor) -> Tensor:
     """(..., 3, 3): the rotation by a vector (..., 3), rad."""
-    cross = torch.linalg.cross(
-        vector[..., None, :].expand(*vector.shape, 3), torch.eye(3, dtype=f64)
+    eye = torch.eye(3, dtype=f64)
+    return torch.matrix_exp(
+        torch.linalg.cross(*torch.broadcast_tensors(vector[..., None, :], eye)).mT
     )
-    return torch.matrix_exp(cross)
 
 
 def rig(
