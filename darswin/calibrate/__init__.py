@@ -1,5 +1,6 @@
-"""Calibration: from pictures of boards to a lens."""
+"""Calibration: from pictures of boards, or of straight lines, to a lens."""
 
 from darswin.calibrate.calibration import Calibration, CalibrationError, calibrate
+from darswin.calibrate.lines import Estimate, estimate
 
-__all__ = ["Calibration", "CalibrationError", "calibrate"]
+__all__ = ["Calibration", "CalibrationError", "Estimate", "calibrate", "estimate"]

@@ -28,7 +28,7 @@ ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.12, 4, 40)  # a₁ and h₀ that are tried
 AS_GOOD = 1.1  # times the least cost: other answers that the pictures allow
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
-UNSURE, OFF = 0.05, 2.0  # of the angle at the rim; px between the model and what lines show
+UNSURE, OFF, COVERED = 0.05, 2.0, 0.8  # of the rim's angle; px; of the radius
 
 
 @dataclass(frozen=True)
@@ -125,35 +125,253 @@ def from_curves(
     lines = _Lines(pieces, np.array(picture), radius, np.array((x, y)) / radius)
     lines.about = 1e-4 if center else 0.002 if circle else 0.01
     lines.rim = None if fov is None else fov / 2
-    if len(pieces) < FEWEST:
-        raise CalibrationError(
-            f"only {len(pieces)} curves may be straight lines, but an estimate needs {FEWEST}: "
-            "give more pictures, or some of rooms, houses or streets"
-        )
     found = _search(lines)
     best = found[0]
-    straight = best.straightness < 1
-    along = [np.bincount(best.nearest[best.fits & (best.lines.picture == p)], minlength=3)
-             for p in best.axes]
-    oriented = sum((of >= 3).sum() >= 2 for of in along)
-    if straight.sum() < FEWEST:
-        raise CalibrationError(f"only {straight.sum()} curves are straight in one and the same lens")
+    straight = int((best.straightness < 1).sum())
+    fitting = (best.apart**2 < best.lines.counts) & (best.nearest >= 0)
+    along = [np.bincount(best.nearest[of][fitting[of]], minlength=3) for of in best.lines.of.values()]
+    oriented = sum(int((counts >= 3).sum() >= 2) for counts in along)
+    if straight < FEWEST:
+        raise CalibrationError(
+            f"only {straight} curves may be straight lines, but an estimate needs {FEWEST}: "
+            "give more pictures, or some of rooms, houses or streets"
+        )
     if fov is None and not oriented:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
-            "in each of two orthogonal directions: give the field of view of the image circle"
+            "in two orthogonal directions: give other pictures, or `fov` of the image circle"
         )
     raw = best.lens(size)
-    far = min(radius * best.rho.max(), raw.r_max.item())
-    raw = raw.with_theta_max(raw.unproject(far).item())
+    end = raw.unproject(min(radius * best.rho.max(), raw.r_max.item())).item()
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     try:
-        lens, error = fit(kind, raw, terms=terms)
+        lens, error = fit(kind, raw.with_theta_max(end), terms=terms)
     except ValueError as reason:
         raise CalibrationError(str(reason)) from reason
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    low, high = (end([rim, *(f.rim for f in found)]) for end in (min, max))
-    spread = best.deviation() if fov is None else 0.0
-    return _described(...)
+    sigma = 0.0 if fov else best.deviation()
+    rims = [rim, *(f.rim for f in found)]
+    interval = min(rims) - sigma, max(rims) + sigma
+    covered = len(np.unique(np.minimum(20 * best.rho, 19.5).astype(int))) / 20
+    degrees = [math.degrees(angle) for angle in (rim, *interval)]
+    scale = (
+        f"the given field of view sets the scale"
+        if fov
+        else f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
+    )
+    verdict = (
+        f"{straight} straight curves over {covered:.0%} of the radius support this lens, and {scale}: "
+        f"{degrees[0]:.1f}° at the rim, from {degrees[1]:.1f}° to {degrees[2]:.1f}°"
+    )
+    doubts = []
+    if interval[1] - interval[0] > 2 * UNSURE * rim:
+        doubts.append("the pictures allow very different fields of view: give more pictures")
+    if error.item() > OFF:
+        doubts.append(f"{model} is up to {error.item():.1f} px from what the lines show")
+    if best.rho.max() < COVERED:
+        doubts.append(f"beyond {best.rho.max():.0%} of the radius, the lens is a guess")
+    return Estimate(lens, rim, radius, interval, straight, covered, verdict, tuple(doubts))
+
+
+class _Lines:
+    """The curves of all pictures, in radii of the image, and how well a lens fits them.
+
+    A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
+    at the distance ρ from the centre (x, y).
+    """
+
+    about: float  # the standard deviation of the centre
+    rim: float | None  # the known θ at ρ = 1
+
+    def __init__(self, pieces: list, picture: np.ndarray, scale: float, center: np.ndarray):
+        self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
+        self.counts = np.array([len(piece) for piece in pieces])
+        self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
+
+    def some(self, keep: np.ndarray) -> "_Lines":
+        kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
+        lines = _Lines(kept, self.picture[keep], self.scale, self.center)
+        lines.about, lines.rim = self.about, self.rim
+        return lines
+
+    def unusual(self, v: np.ndarray) -> np.ndarray:
+        """How far a lens is from usual ones, and from what is known."""
+        bend, (x, y) = abs(v[1]), (v[4:] - self.center) / self.about
+        # Between those of stereographic and equidistant lenses.
+        second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
+        third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
+        off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
+        return np.array((10 * second, 10 * third, 3 * x, 3 * y, off))
+
+
+def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """θ at ρ, and its derivative."""
+    s, h = rho * rho, math.exp(v[0])
+    depth = h * (1 + s * (v[1] + s * (v[2] + s * v[3])))
+    deepens = h * 2 * s * (v[1] + s * (2 * v[2] + s * 3 * v[3]))  # ρ times the derivative
+    return np.arctan2(rho, depth), np.maximum((depth - deepens) / (s + depth**2), 1e-3)
+
+
+def _rim(v: np.ndarray) -> float:
+    return float(_angles(v, np.ones(1))[0][0])
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+class _Seen:
+    """What a lens v sees: the plane through the camera that is closest, in px, to each curve.
+
+    Attributes: miss: px, of the points; straightness: (C,) px², its mean square for each curve;
+    normal: (C, 3) of the planes. After `orient`, axes: three orthogonal directions (3, 3) for each
+    picture; apart: (C,), the root of the sum of squares, px, that the nearest direction adds to a
+    curve; nearest: (C,), its number; cost and rows: of the least-squares problem.
+    """
+
+    def __init__(self, lines: _Lines, v: np.ndarray, near: float, like: "_Seen | None" = None):
+        self.lines, self.v, self.near = lines, v, near
+        offset = np.concatenate(lines.pieces) - v[4:]
+        self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
+        sin, cos = np.sin(theta), np.cos(theta)
+        ray = np.column_stack((sin[:, None] * unit, cos))
+        # The derivatives of rays along and across the radius.
+        along = np.column_stack((cos[:, None] * unit, -sin)) * slope[:, None]
+        across = np.column_stack((-unit[:, 1], unit[:, 0], 0 * rho)) * (sin / rho)[:, None]
+        outer = (ray[:, :, None] * ray[:, None]).reshape(-1, 9)
+        starts, weight = np.cumsum(lines.counts) - lines.counts, rho / (slope * sin)
+        for _ in range(3):
+            scatter = np.add.reduceat(lines.scale**2 * weight[:, None] * outer, starts)
+            spread, self.own = np.linalg.eigh(scatter.reshape(-1, 3, 3))
+            normal = self.own[:, :, 0].repeat(lines.counts, 0)
+            weight = 1 / ((normal * along).sum(1) ** 2 + (normal * across).sum(1) ** 2)
+        if like is not None:  # a plane has two normals
+            self.own *= np.sign((self.own[:, :, 0] * like.normal).sum(1) + 1e-9)[:, None, None]
+            normal = self.own[:, :, 0].repeat(lines.counts, 0)
+        self.normal, self.spread = self.own[:, :, 0], np.maximum(spread, 1e-9)
+        self.miss = lines.scale * (normal * ray).sum(1) * np.sqrt(weight)
+        self.straightness = np.add.reduceat(self.miss**2, starts) / lines.counts
+
+    @property
+    def rim(self) -> float:
+        return _rim(self.v)
+
+    def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """`apart`, with a sign, of curves (K,) from directions (..., 3); (K, ...)."""
+        part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
+        spread = self.spread[of, 1:].reshape(len(of), 2, *[1] * (directions.ndim - 1))
+        return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
+
+    def best_axes(self, of: np.ndarray) -> tuple[float, np.ndarray]:
+        """The directions that suit the curves of a picture, and their cost, by trying those of
+        pairs of long curves."""
+        counts = self.lines.counts[of]
+        normal = self.normal[of[np.argsort(-counts, kind="stable")[:11]]]
+        i, j = np.triu_indices(len(normal), 1)
+        first = _unit(np.cross(normal[i], normal[j]))[:, None]
+        second = _unit(np.cross(first, normal))
+        first = np.broadcast_to(first, second.shape)
+        axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
+        miss = np.abs(self.from_directions(axes, of)).min(-1).T / self.near
+        cost = np.minimum(miss**2, counts).sum(1)
+        return cost.min(), axes[cost.argmin()]
+
+    def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """Directions near `axes` that fit better."""
+        for _ in range(2):
+            apart = self.from_directions(axes, of)
+            nearest = np.abs(apart).argmin(1)
+            apart, nearest = apart[np.arange(len(of)), nearest], axes[nearest]
+            sine = (self.normal[of] * nearest).sum(1)
+            weight = apart / np.where(np.abs(sine) > 1e-12, sine, 1)
+            weight /= 1 + (apart / self.near) ** 2 / self.lines.counts[of]
+            rows = weight[:, None] * np.cross(nearest, self.normal[of])
+            turn = np.linalg.lstsq(rows, -weight * sine, rcond=1e-6)[0]
+            u, _, vh = np.linalg.svd(axes + np.cross(turn, axes) / max(1, 10 * np.hypot(*turn[:2])))
+            axes = u @ vh
+        return axes
+
+    def orient(self, axes: dict[int, np.ndarray], like: "_Seen | None" = None) -> "_Seen":
+        """Itself, with all attributes; the weights of `rows` are those of `like`."""
+        counts, near2 = self.lines.counts, self.near**2
+        self.axes = {p: self.turned(near, self.lines.of[p]) for p, near in axes.items() if p in self.lines.of}
+        self.apart, self.nearest = np.zeros(len(counts)), np.full(len(counts), -1)
+        for p, found in self.axes.items():
+            of = self.lines.of[p]
+            apart = self.from_directions(found, of)
+            self.nearest[of] = np.abs(apart).argmin(1)
+            self.apart[of] = apart[np.arange(len(of)), self.nearest[of]]
+        known = self.lines.unusual(self.v)
+        bent, turned = self.straightness / near2, self.apart**2 / counts / near2
+        self.cost = near2 * (counts * (bent / (1 + bent) + ORTHOGONAL * turned / (1 + turned))).sum()
+        self.cost += (known**2).sum()
+        like = like or self
+        bent, turned = like.straightness / near2, like.apart**2 / counts / near2
+        weight = math.sqrt(ORTHOGONAL) / (1 + turned)
+        self.rows = np.concatenate(((1 / (1 + bent)).repeat(counts) * self.miss, weight * self.apart, known))
+        return self
+
+    def refined(self, steps: int) -> "_Seen":
+        """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
+        found, damping = self, 1e-3
+        for _ in range(steps):
+            def at(v):
+                return _Seen(found.lines, v, found.near, found).orient(found.axes, found)
+            found, before = at(found.v), found.cost
+            slopes = np.stack([(at(found.v + e).rows - found.rows) / 1e-5 for e in 1e-5 * np.eye(6)], 1)
+            square, slope = slopes.T @ slopes, slopes.T @ found.rows
+            while damping < 1e6:
+                damped = square + damping * np.diag(np.diag(square) + 1e-9)
+                trial = at(found.v - np.linalg.solve(damped, slope))
+                damping = damping / 10 if trial.cost < found.cost else damping * 10
+                if trial.cost < found.cost:
+                    found = trial
+                    break
+            if found.cost > (1 - 1e-4) * before:
+                break
+        return found
+
+    def deviation(self) -> float:
+        """The standard deviation of the rim, rad, by the jackknife over groups of curves."""
+        lines, of = self.lines, self.lines.picture
+        group = (of if len(self.lines.of) >= GROUPS else np.arange(len(of))) % GROUPS
+        rims = [
+            _Seen(lines.some(group != k), self.v, self.near).orient(self.axes).refined(4).rim
+            for k in range(GROUPS)
+        ]
+        return math.sqrt((GROUPS - 1) * np.var(rims))
+
+    def lens(self, size: tuple[int, int]) -> OCam:
+        """As a lens for pictures of (H, W)."""
+        scale, (h, a, b, c) = self.lines.scale, (math.exp(self.v[0]), *self.v[1:4])
+        numbers = [-h * scale, 0, -h * a / scale, 0, -h * b / scale**3, 0, -h * c / scale**5]
+        center = torch.from_numpy(scale * self.v[4:])
+        return OCam(torch.tensor(numbers, dtype=torch.float64), center=center, image_size=size)
+
+
+def _search(lines: _Lines) -> list[_Seen]:
+    """The lenses that fit nearly best, the best first."""
+    # First the shape, between those of stereographic and equidistant lenses.
+    shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1) if a < 0 or not c]
+    tried = [_Seen(lines, np.array((0, *shape, *lines.center)), NEAR[1]) for shape in shapes]
+    v = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum()).v
+    for near in NEAR:
+        good = lines.some(_Seen(lines, v, near).straightness < near**2)
+        starts, costs = [], []
+        for depth in DEPTHS:
+            start = _Seen(good, np.array((math.log(depth), *v[1:])), near)
+            found = {p: start.best_axes(of) for p, of in good.of.items() if len(of) >= 3}
+            starts.append((start, {p: axes for p, (_, axes) in found.items()}))
+            costs.append(sum(cost for cost, _ in found.values()))
+        if lines.rim is not None:
+            costs = [abs(start.rim - lines.rim) for start, _ in starts]
+        lows = [k for k in range(len(costs)) if costs[k] == min(costs[max(k - 2, 0) : k + 3])]
+        lows = sorted(lows, key=lambda k: costs[k])[:3]
+        fits = [starts[k][0].orient(starts[k][1]).refined(5) for k in lows]
+        least = min(f.cost for f in fits)
+        fits = sorted((f.refined(30) for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
+        v = fits[0].v
+    return [f for f in fits if f.cost <= AS_GOOD * fits[0].cost]
