@@ -21,9 +21,8 @@ from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 
-MOST, FEWEST = 120, 10  # curves of a picture, and of all
+MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
 STEP = 4  # points of an edge that are averaged
-NEAR = (2.0, 1.0)  # px, in two rounds: curves that miss by more count little
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.12, 4, 40)  # a₁ and h₀ that are tried
 AS_GOOD = 1.1  # times the least cost: other answers that the pictures allow
@@ -116,94 +115,87 @@ def from_curves(
     pieces, picture = [], []
     for number, of_picture in enumerate(curves):
         for curve in of_picture[:MOST]:
-            if circle and (np.hypot(*(curve - circle[:2]).T) > 0.98 * radius).mean() > 0.1:
-                continue  # the edge of the image circle
             points = curve[: len(curve) // STEP * STEP].reshape(-1, STEP, 2).mean(1)
-            if len(points) > 3:
+            at_rim = circle and (np.hypot(*(points - circle[:2]).T) > 0.98 * radius).mean() > 0.1
+            if len(points) > 3 and not at_rim:
                 pieces.append(points / radius)
                 picture.append(number)
-    lines = _Lines(pieces, np.array(picture), radius, np.array((x, y)) / radius)
-    lines.about = 1e-4 if center else 0.002 if circle else 0.01
-    lines.rim = None if fov is None else fov / 2
-    found = _search(lines)
+    about = 1e-4 if center else 0.01 if len(pieces) > ENOUGH and not circle else 0.002
+    known = np.array((x / radius, y / radius, about)), fov and fov / 2
+    _check(len(pieces))
+    found = _search(_Lines(pieces, np.array(picture), radius, *known))
     best = found[0]
-    straight = int((best.straightness < 1).sum())
-    fitting = (best.apart**2 < best.lines.counts) & (best.nearest >= 0)
-    along = [np.bincount(best.nearest[of][fitting[of]], minlength=3) for of in best.lines.of.values()]
-    oriented = sum(int((counts >= 3).sum() >= 2) for counts in along)
-    if straight < FEWEST:
-        raise CalibrationError(
-            f"only {straight} curves may be straight lines, but an estimate needs {FEWEST}: "
-            "give more pictures, or some of rooms, houses or streets"
-        )
+    oriented = best.oriented_pictures()
     if fov is None and not oriented:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
-            "in two orthogonal directions: give other pictures, or `fov` of the image circle"
+            "in two orthogonal directions: give other pictures, or the image circle's field of view"
         )
-    raw = best.lens(size)
-    end = raw.unproject(min(radius * best.rho.max(), raw.r_max.item())).item()
+    raw, last = best.lens(size), best.rho.max()
+    theta = raw.unproject(min(radius * last, raw.r_max.item()))
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     try:
-        lens, error = fit(kind, raw.with_theta_max(end), terms=terms)
+        lens, error = fit(kind, raw.with_theta_max(theta), terms=terms)
     except ValueError as reason:
         raise CalibrationError(str(reason)) from reason
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigma = 0.0 if fov else best.deviation()
-    rims = [rim, *(f.rim for f in found)]
-    interval = min(rims) - sigma, max(rims) + sigma
-    covered = len(np.unique(np.minimum(20 * best.rho, 19.5).astype(int))) / 20
-    degrees = [math.degrees(angle) for angle in (rim, *interval)]
-    scale = (
-        f"the given field of view sets the scale"
-        if fov
-        else f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
-    )
+    sigma, rims = 0.0 if fov else best.deviation(), [rim, *(f.rim for f in found)]
+    low, high = min(rims) - sigma, max(rims) + sigma
+    covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
+    source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
     verdict = (
-        f"{straight} straight curves over {covered:.0%} of the radius support this lens, and {scale}: "
-        f"{degrees[0]:.1f}° at the rim, from {degrees[1]:.1f}° to {degrees[2]:.1f}°"
+        f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
+        f"and {'the given field of view sets the scale' if fov else source}: "
+        "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
     )
-    doubts = []
-    if interval[1] - interval[0] > 2 * UNSURE * rim:
-        doubts.append("the pictures allow very different fields of view: give more pictures")
-    if error.item() > OFF:
-        doubts.append(f"{model} is up to {error.item():.1f} px from what the lines show")
-    if best.rho.max() < COVERED:
-        doubts.append(f"beyond {best.rho.max():.0%} of the radius, the lens is a guess")
-    return Estimate(lens, rim, radius, interval, straight, covered, verdict, tuple(doubts))
+    doubts = {
+        "the pictures allow very different lenses: give more of them": high - low
+        > 2 * UNSURE * rim,
+        f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
+        f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
+    }
+    said = tuple(doubt for doubt, holds in doubts.items() if holds)
+    return Estimate(lens, rim, radius, (low, high), len(best.normal), covered, verdict, said)
+
+
+def _check(count: int) -> None:
+    if count < FEWEST:
+        raise CalibrationError(
+            f"only {count} curves may be straight lines, but an estimate needs {FEWEST}: "
+            "give more pictures, or some of rooms, houses or streets"
+        )
 
 
 class _Lines:
-    """The curves of all pictures, in radii of the image, and how well a lens fits them.
+    """The curves of all pictures, in radii of the image, and what is known of the lens.
 
     A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
-    at the distance ρ from the centre (x, y).
+    at the distance ρ from the centre (x, y). center: (x, y, standard deviation); rim: θ at ρ = 1.
     """
 
-    about: float  # the standard deviation of the centre
-    rim: float | None  # the known θ at ρ = 1
-
-    def __init__(self, pieces: list, picture: np.ndarray, scale: float, center: np.ndarray):
+    def __init__(
+        self, pieces: list[np.ndarray], picture: np.ndarray, scale: float, center: np.ndarray,
+        rim: float | None,
+    ):  # fmt: skip
         self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
+        self.rim, self.points = rim, np.concatenate(pieces)
         self.counts = np.array([len(piece) for piece in pieces])
         self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
 
     def some(self, keep: np.ndarray) -> "_Lines":
         kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
-        lines = _Lines(kept, self.picture[keep], self.scale, self.center)
-        lines.about, lines.rim = self.about, self.rim
-        return lines
+        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim)
 
     def unusual(self, v: np.ndarray) -> np.ndarray:
         """How far a lens is from usual ones, and from what is known."""
-        bend, (x, y) = abs(v[1]), (v[4:] - self.center) / self.about
-        # Between those of stereographic and equidistant lenses.
+        bend, about = abs(v[1]), (v[4:] - self.center[:2]) / self.center[2]
+        # Usual shapes are between those of stereographic and equidistant lenses.
         second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
         third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
         off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
-        return np.array((10 * second, 10 * third, 3 * x, 3 * y, off))
+        return np.array((10 * second, 10 * third, *3 * about, off))
 
 
 def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -226,14 +218,14 @@ class _Seen:
     """What a lens v sees: the plane through the camera that is closest, in px, to each curve.
 
     Attributes: miss: px, of the points; straightness: (C,) px², its mean square for each curve;
-    normal: (C, 3) of the planes. After `orient`, axes: three orthogonal directions (3, 3) for each
+    normal: (C, 3), of the planes. After `orient`, axes: three orthogonal directions (3, 3) of each
     picture; apart: (C,), the root of the sum of squares, px, that the nearest direction adds to a
-    curve; nearest: (C,), its number; cost and rows: of the least-squares problem.
+    curve; nearest: (C,), its number; cost, and rows of the least-squares problem.
     """
 
-    def __init__(self, lines: _Lines, v: np.ndarray, near: float, like: "_Seen | None" = None):
-        self.lines, self.v, self.near = lines, v, near
-        offset = np.concatenate(lines.pieces) - v[4:]
+    def __init__(self, lines: _Lines, v: np.ndarray, like: "_Seen | None" = None):
+        self.lines, self.v = lines, v
+        offset = lines.points - v[4:]
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
         sin, cos = np.sin(theta), np.cos(theta)
@@ -241,19 +233,20 @@ class _Seen:
         # The derivatives of rays along and across the radius.
         along = np.column_stack((cos[:, None] * unit, -sin)) * slope[:, None]
         across = np.column_stack((-unit[:, 1], unit[:, 0], 0 * rho)) * (sin / rho)[:, None]
-        outer = (ray[:, :, None] * ray[:, None]).reshape(-1, 9)
+        outer = lines.scale**2 * (ray[:, :, None] * ray[:, None]).reshape(-1, 9)
         starts, weight = np.cumsum(lines.counts) - lines.counts, rho / (slope * sin)
         for _ in range(3):
-            scatter = np.add.reduceat(lines.scale**2 * weight[:, None] * outer, starts)
-            spread, self.own = np.linalg.eigh(scatter.reshape(-1, 3, 3))
+            scatter = np.add.reduceat(weight[:, None] * outer, starts).reshape(-1, 3, 3)
+            spread, self.own = np.linalg.eigh(scatter)
             normal = self.own[:, :, 0].repeat(lines.counts, 0)
             weight = 1 / ((normal * along).sum(1) ** 2 + (normal * across).sum(1) ** 2)
-        if like is not None:  # a plane has two normals
-            self.own *= np.sign((self.own[:, :, 0] * like.normal).sum(1) + 1e-9)[:, None, None]
-            normal = self.own[:, :, 0].repeat(lines.counts, 0)
-        self.normal, self.spread = self.own[:, :, 0], np.maximum(spread, 1e-9)
         self.miss = lines.scale * (normal * ray).sum(1) * np.sqrt(weight)
         self.straightness = np.add.reduceat(self.miss**2, starts) / lines.counts
+        if like is not None:  # a plane has two normals
+            sign = np.sign((self.own[:, :, 0] * like.normal).sum(1) + 1e-9)
+            self.own *= sign[:, None, None]
+            self.miss *= sign.repeat(lines.counts)
+        self.normal, self.spread = self.own[:, :, 0], np.maximum(spread[:, 1:], 1e-9)
 
     @property
     def rim(self) -> float:
@@ -262,7 +255,7 @@ class _Seen:
     def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
         """`apart`, with a sign, of curves (K,) from directions (..., 3); (K, ...)."""
         part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
-        spread = self.spread[of, 1:].reshape(len(of), 2, *[1] * (directions.ndim - 1))
+        spread = self.spread[of].reshape(len(of), 2, *[1] * (directions.ndim - 1))
         return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
 
     def best_axes(self, of: np.ndarray) -> tuple[float, np.ndarray]:
@@ -275,78 +268,87 @@ class _Seen:
         second = _unit(np.cross(first, normal))
         first = np.broadcast_to(first, second.shape)
         axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
-        miss = np.abs(self.from_directions(axes, of)).min(-1).T / self.near
-        cost = np.minimum(miss**2, counts).sum(1)
+        apart = np.abs(self.from_directions(axes, of)).min(-1).T
+        cost = np.minimum(apart**2, counts).sum(1)
         return cost.min(), axes[cost.argmin()]
 
     def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Directions near `axes` that fit better."""
+        """Directions near `axes` that fit the curves of a picture better."""
         for _ in range(2):
-            apart = self.from_directions(axes, of)
-            nearest = np.abs(apart).argmin(1)
-            apart, nearest = apart[np.arange(len(of)), nearest], axes[nearest]
+            all_ = self.from_directions(axes, of)
+            nearest = np.abs(all_).argmin(1)
+            apart, nearest = all_[np.arange(len(of)), nearest], axes[nearest]
             sine = (self.normal[of] * nearest).sum(1)
             weight = apart / np.where(np.abs(sine) > 1e-12, sine, 1)
-            weight /= 1 + (apart / self.near) ** 2 / self.lines.counts[of]
+            weight /= 1 + apart**2 / self.lines.counts[of]
             rows = weight[:, None] * np.cross(nearest, self.normal[of])
             turn = np.linalg.lstsq(rows, -weight * sine, rcond=1e-6)[0]
-            u, _, vh = np.linalg.svd(axes + np.cross(turn, axes) / max(1, 10 * np.hypot(*turn[:2])))
+            turn /= max(1, 10 * np.linalg.norm(turn))
+            u, _, vh = np.linalg.svd(axes + np.cross(turn, axes))
             axes = u @ vh
         return axes
 
     def orient(self, axes: dict[int, np.ndarray], like: "_Seen | None" = None) -> "_Seen":
-        """Itself, with all attributes; the weights of `rows` are those of `like`."""
-        counts, near2 = self.lines.counts, self.near**2
-        self.axes = {p: self.turned(near, self.lines.of[p]) for p, near in axes.items() if p in self.lines.of}
+        """Itself with all attributes, from directions nearby; `rows` have the weights of `like`."""
+        counts = self.lines.counts
+        self.axes = {p: self.turned(near, self.lines.of[p]) for p, near in axes.items()}
         self.apart, self.nearest = np.zeros(len(counts)), np.full(len(counts), -1)
         for p, found in self.axes.items():
             of = self.lines.of[p]
             apart = self.from_directions(found, of)
             self.nearest[of] = np.abs(apart).argmin(1)
             self.apart[of] = apart[np.arange(len(of)), self.nearest[of]]
-        known = self.lines.unusual(self.v)
-        bent, turned = self.straightness / near2, self.apart**2 / counts / near2
-        self.cost = near2 * (counts * (bent / (1 + bent) + ORTHOGONAL * turned / (1 + turned))).sum()
-        self.cost += (known**2).sum()
+        # A curve that misses its plane or its direction by more than 1 px counts little.
+        unusual, turned = self.lines.unusual(self.v), self.apart**2 / counts
+        bent, turned = (square / (1 + square) for square in (self.straightness, turned))
+        self.cost = (counts * (bent + ORTHOGONAL * turned)).sum() + (unusual**2).sum()
         like = like or self
-        bent, turned = like.straightness / near2, like.apart**2 / counts / near2
-        weight = math.sqrt(ORTHOGONAL) / (1 + turned)
-        self.rows = np.concatenate(((1 / (1 + bent)).repeat(counts) * self.miss, weight * self.apart, known))
+        bends = (self.miss / (1 + like.straightness).repeat(counts)), unusual
+        turns = math.sqrt(ORTHOGONAL) * self.apart / (1 + like.apart**2 / counts)
+        self.rows = np.concatenate((*bends, turns))
         return self
 
     def refined(self, steps: int) -> "_Seen":
         """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
         found, damping = self, 1e-3
         for _ in range(steps):
-            def at(v):
-                return _Seen(found.lines, v, found.near, found).orient(found.axes, found)
-            found, before = at(found.v), found.cost
-            slopes = np.stack([(at(found.v + e).rows - found.rows) / 1e-5 for e in 1e-5 * np.eye(6)], 1)
-            square, slope = slopes.T @ slopes, slopes.T @ found.rows
-            while damping < 1e6:
+            best, before = found, found.cost
+
+            def at(v: np.ndarray, best: _Seen = best) -> _Seen:
+                return _Seen(best.lines, v, best).orient(best.axes, best)
+
+            rows = at(best.v).rows
+            moved = [at(best.v + step).rows - rows for step in 1e-5 * np.eye(6)]
+            slopes = np.stack(moved, 1) / 1e-5
+            square, slope = slopes.T @ slopes, slopes.T @ rows
+            while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = at(found.v - np.linalg.solve(damped, slope))
-                damping = damping / 10 if trial.cost < found.cost else damping * 10
-                if trial.cost < found.cost:
-                    found = trial
-                    break
+                trial = at(best.v - np.linalg.solve(damped, slope))
+                found = trial if trial.cost < before else best
+                damping *= 10 if found is best else 0.1
             if found.cost > (1 - 1e-4) * before:
                 break
         return found
 
+    def oriented_pictures(self) -> int:
+        """The number of pictures with several lines in each of two orthogonal directions."""
+        along = np.where(self.apart**2 < self.lines.counts, self.nearest, -1)
+        return sum(
+            sum(int((along[of] == k).sum() > 2) for k in range(3)) > 1
+            for of in self.lines.of.values()
+        )
+
     def deviation(self) -> float:
         """The standard deviation of the rim, rad, by the jackknife over groups of curves."""
         lines, of = self.lines, self.lines.picture
-        group = (of if len(self.lines.of) >= GROUPS else np.arange(len(of))) % GROUPS
-        rims = [
-            _Seen(lines.some(group != k), self.v, self.near).orient(self.axes).refined(4).rim
-            for k in range(GROUPS)
-        ]
+        group = (of if len(lines.of) >= GROUPS else np.arange(len(of))) % GROUPS
+        depths = math.exp(self.v[0]) * np.geomspace(0.7, 1.4, 9)
+        rims = [_round(lines.some(group != k), self.v, depths)[0].rim for k in range(GROUPS)]
         return math.sqrt((GROUPS - 1) * np.var(rims))
 
     def lens(self, size: tuple[int, int]) -> OCam:
         """As a lens for pictures of (H, W)."""
-        scale, (h, a, b, c) = self.lines.scale, (math.exp(self.v[0]), *self.v[1:4])
+        scale, h, (a, b, c) = self.lines.scale, math.exp(self.v[0]), self.v[1:4]
         numbers = [-h * scale, 0, -h * a / scale, 0, -h * b / scale**3, 0, -h * c / scale**5]
         center = torch.from_numpy(scale * self.v[4:])
         return OCam(torch.tensor(numbers, dtype=torch.float64), center=center, image_size=size)
@@ -354,24 +356,30 @@ class _Seen:
 
 def _search(lines: _Lines) -> list[_Seen]:
     """The lenses that fit nearly best, the best first."""
-    # First the shape, between those of stereographic and equidistant lenses.
-    shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1) if a < 0 or not c]
-    tried = [_Seen(lines, np.array((0, *shape, *lines.center)), NEAR[1]) for shape in shapes]
+    # First the shape alone, like that of stereographic or of equidistant lenses.
+    shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
+    tried = [_Seen(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
     v = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum()).v
-    for near in NEAR:
-        good = lines.some(_Seen(lines, v, near).straightness < near**2)
-        starts, costs = [], []
-        for depth in DEPTHS:
-            start = _Seen(good, np.array((math.log(depth), *v[1:])), near)
-            found = {p: start.best_axes(of) for p, of in good.of.items() if len(of) >= 3}
-            starts.append((start, {p: axes for p, (_, axes) in found.items()}))
-            costs.append(sum(cost for cost, _ in found.values()))
-        if lines.rim is not None:
-            costs = [abs(start.rim - lines.rim) for start, _ in starts]
-        lows = [k for k in range(len(costs)) if costs[k] == min(costs[max(k - 2, 0) : k + 3])]
-        lows = sorted(lows, key=lambda k: costs[k])[:3]
-        fits = [starts[k][0].orient(starts[k][1]).refined(5) for k in lows]
-        least = min(f.cost for f in fits)
-        fits = sorted((f.refined(30) for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
+    for _ in range(2):
+        straight = _Seen(lines, v).straightness < 1
+        _check(straight.sum())
+        fits = _round(lines.some(straight), v, DEPTHS)
         v = fits[0].v
     return [f for f in fits if f.cost <= AS_GOOD * fits[0].cost]
+
+
+def _round(lines: _Lines, v: np.ndarray, depths: np.ndarray) -> list[_Seen]:
+    """The best lenses from a search with any of the depths, the best first."""
+    starts, costs = [], []
+    for depth in depths:
+        start = _Seen(lines, np.array((math.log(depth), *v[1:])))
+        found = {p: start.best_axes(of) for p, of in lines.of.items() if len(of) >= 3}
+        starts.append((start, {p: axes for p, (_, axes) in found.items()}))
+        costs.append(sum(cost for cost, _ in found.values()))
+    lows = [k for k in range(len(costs)) if costs[k] == min(costs[max(k - 2, 0) : k + 3])]
+    if lines.rim is not None:
+        lows = [int(np.argmin([abs(start.rim - lines.rim) for start, _ in starts]))]
+    lows = sorted(lows, key=lambda k: costs[k])[:3]
+    fits = [starts[k][0].orient(starts[k][1]).refined(5) for k in lows]
+    least = min(f.cost for f in fits)
+    return sorted((f.refined(30) for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
