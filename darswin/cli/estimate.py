@@ -66,4 +66,6 @@ def estimate(
     if report is not None:
         replace_file(report, json.dumps(found.to_dict() | {"pictures": files}, indent=1) + "\n")
     if out is not None:
-        write(found.lens, out, None)
+        written = darswin.lens.save(found.lens, out)
+        degrees = math.degrees(found.lens.theta_max.item())
+        print(f"{out}: {written}, {type(found.lens).__name__} up to {degrees:.2f}°")
