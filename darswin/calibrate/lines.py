@@ -134,10 +134,13 @@ def from_curves(
     raw, last = best.lens(size), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
-    try:
-        lens, error = fit(kind, raw.with_theta_max(theta), terms=terms)
-    except ValueError as reason:
-        raise CalibrationError(str(reason)) from reason
+    for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
+        try:
+            lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
+            break
+        except ValueError as reason:
+            if part == 0.8:
+                raise CalibrationError(str(reason)) from reason
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
     lens = lens.with_theta_max(rim if circle else reach(lens))
