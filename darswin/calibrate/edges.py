@@ -77,13 +77,15 @@ def _chains(points: np.ndarray, normal: np.ndarray, size: tuple[int, int]) -> li
     after, before = link
     mutual = (after >= 0) & (before[after] == np.arange(len(points)))
     after = np.where(mutual, after, -1)
-    is_start = np.ones(len(points), bool)
-    is_start[after[mutual]] = False
-    successor, chains = after.tolist(), []
-    for start in np.nonzero(is_start)[0].tolist():
-        chain = [start]
-        while (start := successor[start]) >= 0:
+    is_first = np.ones(len(points), bool)
+    is_first[after[mutual]] = False
+    successor, free, chains = after.tolist(), [True] * len(points), []
+    for start in np.argsort(~is_first, kind="stable").tolist():  # closed curves have no first
+        chain = []
+        while start >= 0 and free[start]:
+            free[start] = False
             chain.append(start)
+            start = successor[start]
         chains.append(chain)
     return chains
 

@@ -1,4 +1,4 @@
-"""`darswin lens estimate`: finds the lens of a camera from ordinary pictures with straight edges."""
+"""`darswin lens estimate`: finds a lens from ordinary pictures with straight edges."""
 
 import json
 import math

@@ -69,8 +69,11 @@ def rim_of(lens, radius=240.0):
     return lens.with_theta_max(None).unproject(radius).item()
 
 
-@pytest.mark.parametrize("model", ["Spherical", "KannalaBrandt"])
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [(name, "Spherical") for name in LENSES]
+    + [(name, "KannalaBrandt") for name in LENSES if name.startswith("kannala")],
+)
 def test_a_lens_is_found_from_lines_in_three_directions(name, model):
     curves = [curves_of(LENSES[name], seed) for seed in (1, 2)]
     found = from_curves(curves, SIZE, model)
@@ -115,7 +118,7 @@ def test_a_factor_of_the_tangent_keeps_lines_straight():
 
 def test_the_centre_is_found_if_there_are_many_curves():
     lens = LENSES["equidistant"]
-    curves = [curves_of(lens, s, 60, bent=0, askew=0, center=(6.0, -4.0)) for s in range(6)]
+    curves = [curves_of(lens, s, 80, bent=0, askew=0, center=(6.0, -4.0)) for s in range(4)]
     found = from_curves(curves, SIZE, "Equidistant")
     torch.testing.assert_close(found.lens.center[0], f64(325.5, 235.5), atol=1.0, rtol=0)
     fixed = from_curves(curves[:2], SIZE, "Equidistant", center=(325.5, 235.5))
