@@ -3,6 +3,8 @@
 Source: Canny, PAMI 1986; Devernay, INRIA RR-2724, 1995.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -39,8 +41,8 @@ def _edge_points(gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 2), px, where the gradient is largest across an edge, and its direction."""
     strength = np.linalg.norm(gradient, axis=-1)
     strong = max(np.quantile(strength, STRONG), LEAST)
-    steps = (np.rint(gradient * 64).astype(np.int16)[..., k] for k in (0, 1))
-    edges = cv2.Canny(*steps, 64 * WEAK * strong, 64 * strong, L2gradient=True)
+    dx, dy = np.rint(64 * gradient).astype(np.int16).transpose(2, 0, 1)
+    edges = cv2.Canny(dx.copy(), dy.copy(), 64 * WEAK * strong, 64 * strong, L2gradient=True)
     y, x = np.nonzero(edges)
     normal = gradient[y, x] / strength[y, x, None]
     # The top of the parabola through three values along the axis that is closer to the gradient.
@@ -113,7 +115,7 @@ def _from_circle(points: np.ndarray) -> np.ndarray:
     return scale * np.abs(rows @ (a, b, c, d)) / np.maximum(slope, 1e-9)
 
 
-def image_circle(pictures: list[np.ndarray]) -> tuple[float, float, float] | None:
+def image_circle(pictures: Sequence[np.ndarray]) -> tuple[float, float, float] | None:
     """The circle (x, y, radius) in px in which a lens shows its pictures on a dark sensor; None if
     they fill the sensor."""
     greys = [p.max(-1) if p.ndim == 3 else p for p in pictures]

@@ -228,6 +228,7 @@ class _Seen:
 
     def __init__(self, lines: _Lines, v: np.ndarray, like: "_Seen | None" = None):
         self.lines, self.v = lines, v
+        self.normal: np.ndarray
         offset = lines.points - v[4:]
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]

@@ -60,7 +60,7 @@ COMMANDS = {
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
-        "draws, describes, converts or crops a calibration, or undistorts pictures and videos",
+        "draws, converts, crops or estimates a calibration, or undistorts pictures and videos",
         PICTURES,
         "darswin.cli.lens:COMMANDS",
     ),
