@@ -1,0 +1,461 @@
+"""Calibration: a lens, and how sure it is, from the corners of boards in pictures."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from darswin.calibrate import radial
+from darswin.calibrate.refine import (
+    MEDIAN,
+    Free,
+    Normal,
+    State,
+    Views,
+    losses,
+    refine,
+    weights_of,
+)
+from darswin.lens import (
+    MODELS,
+    BrownConrady,
+    Fisheye624,
+    Lens,
+    Mei,
+    OCam,
+    Tabulated,
+    to_dict,
+)
+from darswin.lens.base import unknown_model
+from darswin.lens.files.load import reach
+from darswin.lens.fitting import fit_one
+from darswin.lens.ideal import FocalLens
+from darswin.utils.parameters import check, naming
+
+# What "auto" tries; and the terms off the curve that are found for a model.
+CANDIDATES = (
+    "Perspective", "Equidistant", "Equisolid", "Stereographic", "FieldOfView", "EnhancedUnified",
+    "KannalaBrandt", "OCam", "BrownConrady", "Mei", "Fisheye624",
+)  # fmt: skip
+ASIDE = {BrownConrady: {"tangential": 2}, Mei: {"tangential": 2},
+         Fisheye624: {"tangential": 2, "prism": 4}}  # fmt: skip
+TABLE = 12  # the steps of a table
+LEAST_CORNERS, LEAST_PICTURES = 8, 3
+OFF = 6.0  # standard deviations: a corner this far off does not fit
+SHARPEST = 0.05  # px: no detector finds corners better than this
+# For doubts.
+UNSURE, UNKNOWN = 0.01, 0.2  # the radius's standard deviation, as a part of it
+FEW, BLURRED, PARALLEL = 8, 1.0, 12.0  # pictures; px; degrees
+ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
+COVERED = 0.8  # of theta_max
+SHOWN = 5  # corners of a picture
+
+
+class CalibrationError(ValueError):
+    """Corners from which no lens can be found; the message is one sentence for the user."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration:
+    """A lens found from P pictures of a board with K corners, and how sure it is.
+
+    Attributes:
+        lens: the lens, a batch of one in float64. Its theta_max is the largest of its
+            `side_angles`, at most the angle up to which r rises.
+        rotations, translations: (P, 3, 3) and (P, 3): a point (x, y) of the board is at
+            rotation @ (x, y, 0) + translation in the camera's frame, in the board's unit. NaN for
+            pictures that show too few corners.
+        residuals: (P, K, 2) px: the pixels of the lens minus the corners; NaN where not seen.
+        weights: (P, K) in [0, 1]: how much each corner counts.
+        theta: (P, K) rad: the angle of each corner; NaN where not seen.
+        used: (P,) bool: the pictures that count.
+        names: those of the pictures.
+        sigma: px: the standard deviation of a corner along one axis, from the median.
+        error: px: the root mean square distance of corners from the lens, without those off it.
+        left_out: px: the same from a lens that is found without their picture, to first order; NaN
+            for fewer than 4 pictures.
+        supported: rad: the largest angle with corners around it.
+        parameters: the names of the n numbers that were found for the lens.
+        covariance: (n, n), theirs.
+        models: for "auto", the best first: (model, left_out, error, ""), or (model, NaN, NaN, the
+            reason why there is none).
+        doubts: what looks wrong, in sentences. Corners are counted from 1.
+    """
+
+    lens: Lens
+    rotations: Tensor
+    translations: Tensor
+    residuals: Tensor
+    weights: Tensor
+    theta: Tensor
+    used: Tensor
+    names: list[str]
+    sigma: float
+    error: float
+    left_out: float
+    supported: float
+    parameters: list[str]
+    covariance: Tensor
+    models: list[tuple[str, float, float, str]]
+    doubts: list[str]
+    _free: Free = field(repr=False)
+    _vector: Tensor = field(repr=False)
+    _joint: Tensor = field(repr=False)
+
+    def uncertainty(self, pixels: Any) -> Tensor:
+        """(...,) px: the standard deviation of the pixel of a far point, along its worst direction.
+
+        Pixels are (..., 2). As mrcal defines it, the point stays fixed with respect to the boards:
+        its ray moves with the mean rotation of the poses. NaN where no ray lands.
+        """
+        pixels = torch.as_tensor(pixels, dtype=torch.float64)
+        lens = self.lens.with_theta_max(None)
+        rays, count = lens.unproject_points(pixels.reshape(-1, 2)), len(self._vector)
+
+        def place(numbers: Tensor) -> Tensor:
+            turned = torch.linalg.cross(numbers[count:].expand_as(rays), rays)
+            return self._free.at(numbers[:count], lens.theta_max).project_points(rays + turned)
+
+        slopes = torch.func.jacfwd(place)(torch.cat((self._vector, torch.zeros(3).to(rays))))
+        (a, b), (_, d) = ((slopes @ self._joint @ slopes.mT)[:, k].unbind(1) for k in (0, 1))
+        spread = (a + d) / 2 + torch.hypot(b, (a - d) / 2)
+        return spread.sqrt().reshape(pixels.shape[:-1])
+
+    def uncertainty_of_theta(self, theta: Any) -> Tensor:
+        """(...,) px: the standard deviation of the radius r(θ), for θ (...,) rad."""
+        theta = torch.as_tensor(theta, dtype=torch.float64)
+        slopes = torch.func.jacfwd(
+            lambda vector: self._free.at(vector, self.lens.theta_limit).project(theta.flatten())
+        )(self._vector)
+        return ((slopes @ self.covariance) * slopes).sum(-1).sqrt().reshape(theta.shape)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it as a JSON object; NaN becomes None."""
+        named = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        public = {name: _plain(value) for name, value in named.items() if name[0] != "_"}
+        return public | {"lens": to_dict(self.lens)}
+
+
+def _plain(value: Any) -> Any:
+    value = value.tolist() if isinstance(value, Tensor) else value
+    if isinstance(value, list | tuple):
+        return [_plain(x) for x in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def calibrate(
+    corners: Any,
+    board: Any,
+    size: tuple[int, int],
+    model: str | type[Lens] = "KannalaBrandt",
+    *,
+    terms: int | None = None,
+    names: Sequence[str] | None = None,
+    square_pixels: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Calibration:
+    """Finds the lens of a camera from the corners of a board in its pictures.
+
+    It needs no guess, for fields of view up to 250°. Corners and pictures that do not fit the
+    others count little, and `doubts` names them.
+
+    Args:
+        corners: (P, K, 2) px, NaN where a corner was not seen; pixel centres are integers.
+        board: a `Board`, or its points (K, 2), in any unit of length.
+        size: (H, W) of the pictures.
+        model: a lens class, its name in `darswin.lens.MODELS`, or "auto": the model that predicts
+            left-out pictures best.
+        terms: the number of polynomial terms, or of the steps of a table. None means the model's
+            default.
+        names: those of the pictures, for messages. None means "picture 1", ….
+        square_pixels: False also finds the ratio of a pixel's sides.
+        progress: a function that is called with lines of text.
+
+    Raises:
+        CalibrationError: no lens can be found from these corners. ValueError: a wrong shape or an
+            unknown model. TypeError: an argument of another kind.
+    """
+    say = progress or (lambda line: None)
+    whole, points = _checked(corners, board, size)
+    count = len(whole.seen)
+    names = [f"picture {k + 1}" for k in range(count)] if names is None else [*names]
+    check("names", names, len(names) == count, f"{count} names, one for each picture")
+    kinds = [_kind(name) for name in (CANDIDATES if model == "auto" else [model])]
+    if terms is not None:
+        check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
+    usable = _usable(whole, size, names)
+    views = whole._replace(corners=whole.corners[usable], seen=whole.seen[usable])
+    say(f"Finding a start from {len(views.seen)} pictures")
+    start = radial.start(views.corners, views.seen, views.board[:, :2], size)
+    found: list[_Found] = []
+    failed: list[tuple[str, float, float, str]] = []
+    for kind in kinds:
+        say(f"Refining a {kind.__name__} lens")
+        try:
+            found.append(_find(kind, terms, views, start, size, square_pixels))
+        except (CalibrationError, torch.linalg.LinAlgError) as error:
+            reason = error if isinstance(error, CalibrationError) else "The equations fail."
+            failed.append((kind.__name__, math.nan, math.nan, str(reason)))
+    if not found:
+        raise CalibrationError(failed[0][3])
+    # A corner that fits any model counts for all: no model may leave out the rim.
+    counts = torch.stack([one.fits for one in found]).any(0)
+    for one in found:
+        one.judge(views, counts)
+    found.sort(key=lambda one: one.left_out)
+    table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
+    best, miss = found[0], found[0].miss
+    middle, unit = points.mean(0), (points - points.mean(0)).norm(dim=1).max()
+    spot = torch.cat((middle, middle.new_zeros(1)))
+    place = views.points(best.state)
+    theta = torch.atan2(place[..., :2].norm(dim=-1), place[..., 2])
+
+    def all_pictures(value: Tensor, rest: float = math.nan) -> Tensor:
+        return value.new_full((count, *value.shape[1:]), rest).index_put((usable,), value)
+
+    lens, seen = best.state.lens, views.seen
+    supported = theta[best.fits].quantile(0.99).item()
+    lens = lens.with_theta_max(reach(lens))
+    calibration = Calibration(
+        lens=lens,
+        rotations=all_pictures(best.state.rotations),
+        translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
+        residuals=all_pictures(torch.where(seen[..., None], miss, torch.nan)),
+        weights=all_pictures(weights_of(miss, best.scale) * (seen & best.used[:, None]), 0.0),
+        theta=all_pictures(torch.where(seen, theta, torch.nan)),
+        used=all_pictures(best.used, False),
+        names=names,
+        sigma=best.sigma,
+        error=best.error,
+        left_out=best.left_out,
+        supported=supported,
+        parameters=best.free.names,
+        covariance=best.joint[:-3, :-3],
+        models=table if model == "auto" else [],
+        doubts=[],
+        _free=best.free,
+        _vector=best.state.vector,
+        _joint=best.joint,
+    )
+    calibration.doubts.extend(_doubts(calibration, whole, best, place))
+    return calibration
+
+
+def _kind(model: Any) -> type[Lens]:
+    if isinstance(model, str):
+        if model not in MODELS:
+            raise naming(ValueError(f"`model`: {unknown_model(model)}"), "model")
+        return MODELS[model]
+    if not (isinstance(model, type) and issubclass(model, Lens)):
+        raise TypeError(f"model must be a lens class or its name, got {model!r}")
+    return model
+
+
+class _Found:
+    """A lens of one model with the poses, and what is known of them."""
+
+    error = left_out = math.nan
+    joint: Tensor
+
+    def __init__(self, free: Free, state: State, scale: float, views: Views, used: Tensor):
+        self.free, self.state, self.scale, self.used = free, state, scale, used
+        self.miss = views.miss(state)
+        counts = views.seen & used[:, None]
+        distance = self.miss.norm(dim=-1)
+        numbers = 2 * int(counts.sum())
+        spare = max(numbers - len(state.vector) - 6 * int(used.sum()), 1)
+        self.sigma = distance[counts].median().item() / MEDIAN * math.sqrt(numbers / spare)
+        self.fits = counts & (distance <= OFF * max(self.sigma, SHARPEST))
+
+    def judge(self, views: Views, counts: Tensor) -> None:
+        """Computes the covariance and the errors, over the corners that count, (P, K)."""
+        used = counts.any(1)
+        views = Views(views.corners[used], views.seen[used], views.board)
+        state, miss, counts = self.state.of(used), self.miss[used], counts[used]
+        slopes = views.slopes(self.free, state)
+        normal = Normal(slopes, miss, counts.to(miss), self.free, state.vector).damped(0.0)
+        self.joint = self.sigma**2 * normal.covariance()
+        self.error = miss[counts].square().sum(-1).mean().sqrt().item()
+        if len(miss) > LEAST_PICTURES:
+            moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
+            self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
+
+
+def _find(
+    model: type[Lens], terms: int | None, views: Views, start: radial.Start,
+    size: tuple[int, int], square_pixels: bool,
+) -> _Found:  # fmt: skip
+    """The lens of a model and the poses, from all pictures that agree."""
+    rays, used, board = start.rays(views.corners), start.fits, views.board[:, :2]
+    theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+    top = theta[views.seen & used[:, None]].max().item()
+    lens = _start_lens(model, terms, start, top, size)
+    free = Free(lens, square_pixels)
+    state = State(free.start, lens, *radial.poses(rays, views.seen.to(rays), board))
+    for _ in range(4):
+        counts = views.seen & used[:, None]
+        state, scale = refine(views._replace(seen=counts), free, state)
+        # Each pose anew from its rays: some may be mirrored, some pictures may fit after all.
+        rays = state.lens.unproject_points(views.corners)
+        there = (views.seen & ~rays.isnan().any(-1)).to(rays)
+        again = State(*state[:2], *radial.poses(rays.nan_to_num(), there, board))
+        again, _ = refine(views, free, again, lens_moves=False)
+        loss, other = (losses(views.miss(x), scale).sum(1) for x in (state, again))
+        better = other < loss - 0.1
+        state = state.with_poses(better, again)
+        distance = views.miss(state).norm(dim=-1)
+        typical = torch.where(views.seen, distance, torch.nan).nanmedian(1).values
+        sigma = max(distance[counts].median().item() / MEDIAN, SHARPEST)
+        before, used = used, typical <= OFF * sigma
+        if used.sum() < LEAST_PICTURES:
+            raise CalibrationError(
+                f"Only {int(used.sum())} pictures agree on a {model.__name__} lens: are the board "
+                "and the order of its corners right?"
+            )
+        if torch.equal(before, used) and not better[used].any():
+            break
+    return _Found(free, state, scale, views, used)
+
+
+def _start_lens(
+    model: type[Lens], terms: int | None, start: radial.Start, top: float, size: tuple[int, int]
+) -> Lens:
+    """The lens of a model that is close to the start up to the angle `top`, rad."""
+    end = model._end if issubclass(model, FocalLens) else math.pi
+    if top > end + 0.1:
+        raise CalibrationError(
+            f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
+            f"lens ends at {math.degrees(end):.0f}°: choose another model."
+        )
+    image = {"center": start.center[None], "image_size": start.center.new_tensor([size])}
+    curve = OCam(-start.depth[None], **image)
+    limit = curve.theta_limit.item()
+    if issubclass(model, Tabulated):
+        angles = torch.linspace(0, min(1.03 * top + 0.02, limit), (terms or TABLE) + 1)
+        return Tabulated(angles.to(curve.center), curve.project(angles.to(curve.center)), **image)
+    for share in (1.0, 0.9, 0.7, 0.5):
+        short = curve.with_theta_max(share * min(top, limit, 0.97 * end))
+        try:
+            found = fit_one(model, short, model.terms if terms is None else terms, rounds=20)
+        except ValueError:
+            continue
+        aside = {name: start.center.new_zeros(1, n) for name, n in ASIDE.get(model, {}).items()}
+        return model(**found._tensors() | aside | image | {"theta_max": None})
+    raise CalibrationError(f"No {model.__name__} lens is close to the start: try another model.")
+
+
+def _doubts(found: Calibration, views: Views, best: _Found, place: Tensor) -> list[str]:
+    """What looks wrong; CalibrationError if the pictures do not determine the lens."""
+    said, used = [], best.used
+    theta = torch.linspace(0.3, 1, 8, dtype=torch.float64) * found.supported
+    spread = (found.uncertainty_of_theta(theta) / found.lens.project(theta)).max().item()
+    spread *= max(1.0, SHARPEST / max(found.sigma, 1e-12))
+    if not spread <= UNSURE:
+        tilt = torch.acos(best.state.rotations[used, 2, 2].abs().clamp(max=1)).max().rad2deg()
+        why = "take more pictures, with tilted boards that fill more of the picture"
+        if tilt < PARALLEL:
+            why = "all boards are nearly parallel to the sensor: tilt them by 20 to 45°"
+        if not spread <= UNKNOWN:
+            raise CalibrationError(f"The pictures do not determine the lens: {why}.")
+        said.append(f"the radius is unsure by {100 * spread:.2g} %: {why}")
+    distance = found.residuals.norm(dim=-1)
+    for k, name in enumerate(found.names):
+        off = distance[k] > OFF * max(found.sigma, SHARPEST)
+        corners = [(distance[k, i].item(), i + 1) for i in off.nonzero()[:, 0].tolist()]
+        if found.used[k]:
+            corners.sort(reverse=True)
+            said += [f"corner {i} of {name} is {d:.3g} px off" for d, i in corners[:SHOWN]]
+            if len(corners) > SHOWN:
+                said.append(f"{len(corners) - SHOWN} more corners of {name} are off")
+        elif found.rotations[k].isnan().any():
+            said.append(
+                f"{name} shows {int(views.seen[k].sum())} corners; {LEAST_CORNERS} are needed, "
+                "not on one line"
+            )
+        else:
+            typical = distance[k].nanmedian()
+            said.append(f"{name} does not fit: half of its corners are {typical:.3g} px off")
+    if used.sum() < FEW:
+        said.append(f"{int(used.sum())} pictures are few: take 10 to 20")
+    if found.sigma > BLURRED:
+        said.append(
+            f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
+            "or another model fits better"
+        )
+    far = best.state.translations[used].norm(dim=1)
+    if far.max() < ONE_DISTANCE * far.min():
+        said.append("all boards are at one distance: take some nearer and some farther")
+    normals = best.state.rotations[:, :, 2]
+    behind = found.used.nonzero()[(normals * place.mean(1)).sum(1)[used] < 0, 0].tolist()
+    if behind:
+        which = ", ".join(found.names[k] for k in behind[:SHOWN])
+        said.append(f"the board is mirrored, or seen from behind, in {len(behind)}: {which}")
+    end = found.lens.theta_max.item()
+    if found.supported < COVERED * end:
+        said.append(
+            f"corners reach {math.degrees(found.supported):.0f}° from the axis, but the sensor "
+            f"{math.degrees(end):.0f}°: in between, the lens is a guess"
+        )
+    return said
+
+
+def _numbers(name: str, value: Any) -> Tensor:
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise naming(TypeError(f"`{name}` must be numbers, got {value!r:.200}"), name) from error
+
+
+def _checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Tensor]:
+    """The views, of a board with its middle at 0 and a size of 1, and the board's points."""
+    points = _numbers("board", getattr(board, "points", board))
+    shaped = points.dim() == 2 and points.shape[1] == 2
+    check("board", tuple(points.shape), shaped, "a Board or points of shape (K, 2)")
+    check("board", points.tolist(), bool(points.isfinite().all()), "finite")
+    found, shape = _numbers("corners", corners), (len(points), 2)
+    shaped = found.dim() == 3 and found.shape[1:] == shape
+    check("corners", tuple(found.shape), shaped, f"of shape (P, {len(points)}, 2)")
+    check("corners", "infinity", not bool(found.isinf().any()), "finite, or NaN where not seen")
+    whole = isinstance(size, tuple | list | torch.Size) and len(size) == 2
+    whole = whole and all(isinstance(side, int) and side > 0 for side in size)
+    check("size", size, whole, "(H, W) in whole pixels")
+    seen = ~found.isnan().any(-1)
+    flat = points - points.mean(0)
+    flat = flat / flat.norm(dim=1).amax().clamp(min=1e-300) if len(points) else flat
+    if not _spans(flat, torch.ones(len(flat)).bool()):
+        raise CalibrationError(
+            f"A board needs {LEAST_CORNERS} points or more, not on one line, got {len(points)}."
+        )
+    board = torch.nn.functional.pad(flat, (0, 1))
+    return Views(torch.where(seen[..., None], found, 0.0), seen, board), points
+
+
+def _spans(flat: Tensor, seen: Tensor) -> Tensor:
+    """(...) bool: enough of the points (K, 2) are seen, (..., K), and they are not on one line."""
+    count, part = seen.sum(-1), seen[..., None] * flat
+    apart = part - seen[..., None] * part.sum(-2, keepdim=True) / count[..., None, None].clamp(1)
+    thin = torch.linalg.eigvalsh(apart.mT @ apart)[..., 0] < 1e-3 * count / max(len(flat), 1)
+    return (count >= LEAST_CORNERS) & ~thin
+
+
+def _usable(views: Views, size: tuple[int, int], names: list[str]) -> Tensor:
+    """(P,) bool: the pictures with enough corners, not all on one line."""
+    sides = views.corners.new_tensor([size[1], size[0]])
+    outside = ((views.corners < -1) | (views.corners > sides)).any(-1) & views.seen
+    for k, i in outside.nonzero()[:1].tolist():
+        x, y = views.corners[k, i].tolist()
+        raise CalibrationError(
+            f"{names[k]} has a corner at ({x:.4g}, {y:.4g}), outside of a picture of "
+            f"{size[1]}×{size[0]} (W×H) px: all pictures must be of one size."
+        )
+    usable = _spans(views.board[:, :2], views.seen)
+    if usable.sum() < LEAST_PICTURES:
+        raise CalibrationError(
+            f"At least {LEAST_PICTURES} pictures that show {LEAST_CORNERS} corners, not on one "
+            f"line, are needed, got {int(usable.sum())}: take 10 to 20 pictures."
+        )
+    return usable

@@ -1,0 +1,255 @@
+"""The refinement of a calibration: the lens and all poses together, by robust least squares.
+
+Levenberg–Marquardt steps in float64 on the distances of corners in pixels. A pose touches its own
+picture only, so the poses are eliminated first (the Schur complement).
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from darswin.lens import Lens, OCam, OCamInverse, Tabulated
+from darswin.lens.fitting import Packing
+
+ROUNDS = 100
+LOST = 1e4  # px: the distance of a corner whose ray the lens does not see
+SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
+FINEST = 1e-4  # px: the least scale
+# The distance that 50 % and 90 % of the corners do not exceed, in standard deviations.
+MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.9))
+# The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
+HELD = {(OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0], (Tabulated, "radii"): [0],
+        (Tabulated, "angles"): slice(None)}  # fmt: skip
+
+
+class Free:
+    """The free numbers of a lens as a vector (n,), and the lens of a vector.
+
+    Free are the parameters of the model and the principal point; and, unless pixels are square, the
+    ratio of their sides. OCam's linear term stays 0, and a table's angles stay as they are.
+    """
+
+    def __init__(self, lens: Lens, square_pixels: bool):
+        tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
+        tensors["center"] = lens.center
+        held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
+        for (model, name), places in HELD.items():
+            if isinstance(lens, model):
+                held[name][places] = True
+        if not square_pixels:
+            tensors["affine"] = lens._affine()
+            held["affine"] = torch.tensor([[True, True], [True, False]])
+        free = ~torch.cat([value.flatten() for value in held.values()])
+        names = [
+            name + (f"[{k}]" if value.dim() > 1 else "")
+            for name, value in tensors.items()
+            for k in range(value[0].numel())
+        ]
+        self.names = [name for name, is_free in zip(names, free, strict=True) if is_free]
+        self.model, self.image_size = type(lens), lens.image_size
+        self.packing = Packing(self.model, tensors)
+        self.low, self.high = self.packing.low[free], self.packing.high[free]
+        vector = self.packing.vector(tensors)
+        self.start, self._rest = vector[free], torch.where(free, 0, vector)
+        self._places = torch.eye(len(vector)).to(vector)[:, free]
+
+    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
+        """The parameters of the lens."""
+        found = self.packing.tensors(self._rest + self._places @ vector)
+        if self.model is OCamInverse:  # r(0) = 0
+            slopes = found["coefficients"][:, 1:]
+            powers = (-math.pi / 2) ** torch.arange(1, slopes.shape[1] + 1).to(vector)
+            found["coefficients"] = torch.cat((-(slopes * powers).sum(1, keepdim=True), slopes), 1)
+        return found | {"image_size": self.image_size}
+
+    def lens(self, vector: Tensor) -> Lens | None:
+        """The lens up to its limit; None if there is none."""
+        try:
+            return self.model(**self.tensors(vector))
+        except ValueError:
+            return None
+
+    def at(self, vector: Tensor, theta_max: Tensor) -> Lens:
+        """The lens without checks; differentiable."""
+        return self.model._from_tensors(self.tensors(vector) | {"theta_max": theta_max})
+
+    def held(self, vector: Tensor, side: Tensor) -> Tensor:
+        """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""
+        return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
+
+
+class State(NamedTuple):
+    """The free numbers, their lens, and the poses of the boards."""
+
+    vector: Tensor
+    lens: Lens
+    rotations: Tensor
+    translations: Tensor
+
+    def of(self, pictures: Tensor) -> "State":
+        """The poses of some pictures, (P,) bool."""
+        rotations, translations = self.rotations[pictures], self.translations[pictures]
+        return State(self.vector, self.lens, rotations, translations)
+
+    def with_poses(self, pictures: Tensor, other: "State") -> "State":
+        """The poses of some pictures, (P,) bool, from another state."""
+        rotations = torch.where(pictures[:, None, None], other.rotations, self.rotations)
+        translations = torch.where(pictures[:, None], other.translations, self.translations)
+        return State(self.vector, self.lens, rotations, translations)
+
+    def moved(self, free: Free, steps: Tensor, lens_moves: bool) -> "State | None":
+        """The state after steps (P, n + 6); None if it has no lens."""
+        count, lens = len(self.vector), self.lens
+        vector = (self.vector + steps[0, :count]).clamp(free.low, free.high)
+        if lens_moves and (lens := free.lens(vector)) is None:
+            return None
+        axes = torch.broadcast_tensors(steps[:, None, count:-3], torch.eye(3).to(steps))
+        turns = torch.matrix_exp(torch.linalg.cross(*axes).mT)
+        return State(vector, lens, turns @ self.rotations, self.translations + steps[:, -3:])
+
+
+class Views(NamedTuple):
+    """What is calibrated from: corners (P, K, 2) px, 0 where not `seen`, (P, K), and the board's
+    points (K, 3), whose z is 0."""
+
+    corners: Tensor
+    seen: Tensor
+    board: Tensor
+
+    def points(self, state: State) -> Tensor:
+        """(P, K, 3): the board's points in the camera's frame."""
+        return self.board @ state.rotations.mT + state.translations[:, None]
+
+    def miss(self, state: State) -> Tensor:
+        """(P, K, 2) px: by how much the lens misses the corners; 0 where not seen."""
+        off = state.lens.project_points(self.points(state)) - self.corners
+        off = torch.where(off.isnan().any(-1, keepdim=True), LOST, off)
+        return torch.where(self.seen[..., None], off, 0.0)
+
+    def slopes(self, free: Free, state: State) -> Tensor:
+        """(P, K, 2, n + 6): the derivatives of the pixels by the free numbers, by the rotation
+        vector of each pose in the camera's frame, and by its translation; 0 where not seen."""
+        points, count = self.points(state), len(state.vector)
+
+        def along(way: Tensor) -> Tensor:
+            tangents = way[:count], way[count:].expand_as(points)
+            return torch.func.jvp(
+                lambda vector, points: free.at(vector, state.lens.theta_max).project_points(points),
+                (state.vector, points),
+                tangents,
+            )[1]
+
+        ways = torch.eye(count + 3).to(points)
+        slopes = torch.func.vmap(along, out_dims=-1)(ways)
+        there = self.seen & slopes.isfinite().flatten(2).all(-1)
+        slopes = torch.where(there[..., None, None], slopes, 0.0)
+        by_point = slopes[..., count:]
+        # A turn ω moves a point by ω × turned.
+        turned = (self.board @ state.rotations.mT)[:, :, None].expand_as(by_point)
+        by_turn = torch.linalg.cross(turned, by_point)
+        return torch.cat((slopes[..., :count], by_turn, by_point), -1)
+
+
+class Normal:
+    """The normal equations of a step after the poses are eliminated, for slopes (P, K, 2, n + 6),
+    misses (P, K, 2) and weights (P, K); numbers of the lens that are held do not move."""
+
+    def __init__(
+        self, slopes: Tensor, miss: Tensor, weights: Tensor, free: Free, vector: Tensor,
+        lens_moves: bool = True,
+    ):  # fmt: skip
+        flat = (slopes * weights[..., None, None]).flatten(1, 2)
+        self.matrix = flat.mT @ slopes.flatten(1, 2)
+        self.side = -(flat.mT @ miss.flatten(1, 2)[..., None])[..., 0]
+        self.count = len(vector)
+        squares = self.matrix.diagonal(dim1=1, dim2=2)
+        self.scale = torch.where(
+            torch.arange(squares.shape[1]) < self.count, squares.sum(0), squares
+        ).clamp(min=1e-30).rsqrt()  # fmt: skip
+        held = free.held(vector, self.side[:, : self.count].sum(0)) | (not lens_moves)
+        self.scale[:, : self.count] *= ~held
+
+    def damped(self, damping: float) -> "Normal":
+        """The same after elimination, in units in which the diagonals are 1."""
+        n = self.count
+        matrix = self.scale[:, :, None] * self.matrix * self.scale[:, None]
+        side = self.scale * self.side
+        # A picture without corners has no equations.
+        poses = matrix[:, n:, n:] + (damping + 1e-14) * torch.eye(6).to(matrix)
+        self.inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(poses)[0])
+        self.own = (self.inverse @ side[:, n:, None])[..., 0]
+        self.follow = -self.inverse @ matrix[:, n:, :n]
+        self.lens = matrix[:, :n, :n] + matrix[:, :n, n:] @ self.follow
+        self.lens_side = side[:, :n] + (self.follow.mT @ side[:, n:, None])[..., 0]
+        self.damping = damping * torch.eye(n).to(matrix)
+        return self
+
+    def steps(self, left_out: bool = False) -> Tensor:
+        """(P, n + 6): the step of the lens, and that of each pose; `left_out`: of a lens without
+        the equations of the pose's picture."""
+        matrix, side = self.lens.sum(0) + self.damping, self.lens_side.sum(0)
+        if left_out:
+            matrix, side = matrix - self.lens, side - self.lens_side
+        lens = (_inverse(matrix) @ side[..., None])[..., 0].expand_as(self.lens_side)
+        poses = self.own + (self.follow @ lens[..., None])[..., 0]
+        return self.scale * torch.cat((lens, poses), 1)
+
+    def covariance(self) -> Tensor:
+        """(n + 3, n + 3): of the lens and the mean rotation of the poses, for corners with a
+        standard deviation of 1 px."""
+        size = self.scale[:, self.count : -3, None]
+        both = torch.cat(
+            (torch.diag(self.scale[0, : self.count]), (size * self.follow[:, :3]).mean(0))
+        )
+        joint = both @ _inverse(self.lens.sum(0)) @ both.T
+        joint[-3:, -3:] += (size * self.inverse[:, :3, :3] * size.mT).mean(0) / len(size)
+        return joint
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """The inverse of symmetric matrices (..., n, n); what is not determined is very large."""
+    values, vectors = torch.linalg.eigh(matrix)
+    values = values.clamp(min=1e-14 * values[..., -1:].clamp(min=1e-14))
+    return (vectors / values[..., None, :]) @ vectors.mT
+
+
+def refine(
+    views: Views, free: Free, state: State, lens_moves: bool = True
+) -> tuple[State, float]:  # fmt: skip
+    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss."""
+    miss = views.miss(state)
+    damping, scale, fine, still = 1e-3, math.inf, False, 0
+    for _ in range(ROUNDS):
+        distance = miss.norm(dim=-1)[views.seen]
+        part, typical = (0.5, MEDIAN) if fine else (0.9, MOST)
+        scale = max(min(scale, SCALE * distance.quantile(part).item() / typical), FINEST)
+        before = cost = losses(miss, scale).sum().item()
+        slopes, weights = views.slopes(free, state), weights_of(miss, scale)
+        normal = Normal(slopes, miss, weights, free, state.vector, lens_moves)
+        while damping < 1e10:
+            trial = state.moved(free, normal.damped(damping).steps(), lens_moves)
+            if trial is not None:
+                trial_miss = views.miss(trial)
+                cost = losses(trial_miss, scale).sum().item()
+                if cost < before:
+                    state, miss, damping = trial, trial_miss, max(damping / 10, 1e-12)
+                    break
+            damping *= 10
+        still = still + 1 if cost > (1 - (1e-6 if fine else 1e-3)) * before else 0
+        if damping >= 1e10 or still >= 2:
+            if fine:
+                break
+            fine, damping, still = True, 1e-4, 0
+    return state, scale
+
+
+def weights_of(miss: Tensor, scale: float) -> Tensor:
+    """(P, K): the weight of each corner in the Cauchy loss."""
+    return 1 / (1 + miss.square().sum(-1) / scale**2)
+
+
+def losses(miss: Tensor, scale: float) -> Tensor:
+    """(P, K): the Cauchy loss of each corner."""
+    return (miss.square().sum(-1) / scale**2).log1p()
