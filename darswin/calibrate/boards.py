@@ -1,7 +1,7 @@
 """Calibration boards, and their corners in pictures."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -99,26 +99,39 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
     grey = np.ascontiguousarray(with_channels(np.atleast_3d(picture), 1)[..., 0])
     find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
     for grid in find(grey, board):
-        if is_orderly(grid, board) and is_orderly(refined := _refined(grey, grid, board), board):
-            return refined.reshape(-1, 2)
+        grid = _refined(grey, grid, board) if np.isfinite(grid).any() else grid
+        least = 0.9 * np.isfinite(grid).sum()
+        # Markers tell each corner, so single wrong ones can be left out.
+        while (odd := wrong(grid, board)).any() and board.kind != "chessboard":
+            grid[odd == odd.max()] = np.nan
+        if np.isfinite(grid).sum() >= max(8, least) and not odd.any():
+            return grid.reshape(-1, 2)
     return np.full(board.points.shape, np.nan)
 
 
-def is_orderly(grid: np.ndarray, board: Board) -> bool:
-    """True if corners (rows, columns, 2) px are in order, as a smooth lens shows them: no square is
-    crossed or mirrored, and steps along rows and columns change little from one to the next."""
+def wrong(grid: np.ndarray, board: Board) -> np.ndarray:
+    """(rows, columns): how often each of the corners (rows, columns, 2) px disagrees with its
+    neighbours. As a smooth lens shows a board, no square is crossed or mirrored, and steps along
+    rows and columns change little from one to the next."""
+    odd = np.zeros(grid.shape[:2], int)
+
+    def mark(bad: np.ndarray, *places: tuple[int, int]) -> None:
+        for row, column in places:
+            odd[row : row + bad.shape[0], column : column + bad.shape[1]] += bad
+
     across, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
-    turns = [_cross(a, d) for a in (across[:-1], across[1:]) for d in (down[:, :-1], down[:, 1:])]
-    if any((turn <= 0).any() for turn in turns) or np.isfinite(turns[0]).sum() < 2:
-        return False
+    for i, a in enumerate((across[:-1], across[1:])):
+        for j, d in enumerate((down[:, :-1], down[:, 1:])):
+            mark(_cross(a, d) <= 0, (i, 0), (i, 1), (1 - i, j))
     for axis in (0, 1):
-        lengths = np.linalg.norm(np.diff(_shaped(board.points, board), axis=axis), axis=-1)
-        steps = np.diff(grid, axis=axis) / lengths[..., None]
-        length = np.linalg.norm(steps, axis=-1).swapaxes(0, axis)
-        change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1).swapaxes(0, axis)
-        if (change > MOST_CHANGE * np.minimum(length[1:], length[:-1])).any():
-            return False
-    return True
+        units = np.linalg.norm(np.diff(_shaped(board.points, board), axis=axis), axis=-1)
+        steps = np.diff(grid, axis=axis) / units[..., None]
+        ahead, behind = ((slice(k, k - 1 or None),) for k in (0, 1))
+        px, where = np.linalg.norm(steps, axis=-1), (slice(None),) * axis
+        least = np.minimum(px[where + ahead], px[where + behind])
+        change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
+        mark(change > MOST_CHANGE * least, *((k * (1 - axis), k * axis) for k in range(3)))
+    return odd
 
 
 def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
@@ -135,6 +148,56 @@ def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
         for a in (grid, _shaped(board.points, board))
     )
     return np.fmin.reduce([p / u for p, u in zip(px, units, strict=True)])
+
+
+def edge_width(picture: np.ndarray, corners: np.ndarray, board: Board) -> float:
+    """px, of the edges at the corners of a board: 2 where they are sharp, and 2.5 σ where they are
+    blurred by a Gaussian."""
+    grey = with_channels(np.atleast_3d(picture), 1)[..., 0].astype(np.float64)
+    reach = pixels_per_unit(_shaped(corners, board), board).ravel() * board.reach
+    widths = []
+    for (x, y), half in zip(corners, np.clip(reach, 2, 15), strict=True):
+        if np.isfinite((x, half)).all():
+            rows, columns = (slice(max(0, int(at - half)), int(at + half) + 2) for at in (y, x))
+            patch = grey[rows, columns]
+            widths.append(np.ptp(patch) / max(np.hypot(*np.gradient(patch)).max(), 1e-9))
+    return float(np.median(widths))
+
+
+def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] | None:
+    """The middle (x, y) and the radius, px, of the circle that a fisheye fills on its sensor.
+
+    None if there is none: the pictures have bright corners, or their bright part is not round.
+    """
+    brightest = np.maximum.reduce([with_channels(np.atleast_3d(p), 1)[..., 0] for p in pictures])
+    light = cv2.GaussianBlur(brightest, (0, 0), 1.0).astype(np.float64)
+    height, width = light.shape
+    part = max(2, min(height, width) // 40)
+    ends = [light[:part], light[-part:]]
+    dark = max(
+        np.median(end[:, side]) for end in ends for side in (slice(part), slice(-part, None))
+    )
+    middle = np.median(light[height // 4 : -height // 4, width // 4 : -width // 4])
+    if dark > 0.25 * middle:
+        return None
+    there = light > dark + max(4.0, 0.15 * (middle - dark))
+    rows, columns = there.any(1).nonzero()[0], there.any(0).nonzero()[0]
+    x = [there.argmax(1)[rows], width - 1 - there[:, ::-1].argmax(1)[rows], columns, columns]
+    y = [rows, rows, there.argmax(0)[columns], height - 1 - there[::-1].argmax(0)[columns]]
+    rim = np.stack((np.concatenate(x), np.concatenate(y)), 1).astype(np.float64)
+    rim = rim[((rim > 1) & (rim < (width - 2, height - 2))).all(1)]
+    kept, near = rim, 0.0
+    for _ in range(20):
+        if len(kept) < 16:
+            return None
+        terms = np.column_stack((2 * kept, np.ones(len(kept))))
+        a, b, c = np.linalg.lstsq(terms, (kept**2).sum(1), rcond=None)[0]
+        radius = math.sqrt(max(c + a * a + b * b, 0.0))
+        off = np.abs(np.hypot(*(rim - (a, b)).T) - radius)
+        near = max(1.5, 0.01 * radius, float(np.median(off)))
+        kept = rim[off < near]
+    round_ = near <= max(1.5, 0.01 * radius) and len(kept) > 0.6 * len(rim)
+    return (float(a), float(b), radius) if round_ else None
 
 
 def _scales(grey: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
@@ -165,9 +228,7 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
 def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     size = board.columns + 1, board.rows + 1
     drawn = cv2.aruco.CharucoBoard(size, board.square, board.other, _dictionary(board.dictionary))
-    settings = cv2.aruco.CharucoParameters()
-    settings.minMarkers = 1
-    detector = cv2.aruco.CharucoDetector(drawn, settings, _parameters())
+    detector = cv2.aruco.CharucoDetector(drawn, detectorParams=_parameters())
     yield _shaped(_collected(grey, detector.detectBoard, len(board.points), 1), board)
 
 
@@ -175,14 +236,18 @@ def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     """The grids for tags with a border of one bit, or two as Kalibr's, which count from the upper
     or the lower left, and whose first corner is any of the four."""
     rows, columns = board.rows // 2, board.columns // 2
+    markers, found = _dictionary(board.dictionary), []
     for border in (1, 2):
-        detector = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(border))
-        tags = _collected(grey, detector.detectMarkers, rows * columns, 4)
-        for turn in range(4):
-            # A tag's corners run clockwise: upper left, upper right, lower right, lower left.
-            cells = np.roll(tags, turn, 1)[:, [0, 1, 3, 2]].reshape(rows, columns, 2, 2, 2)
-            for way in (cells, cells[::-1]):
-                yield _shaped(way.swapaxes(1, 2), board)
+        detector = cv2.aruco.ArucoDetector(markers, _parameters(border))
+        found.append(_collected(grey, detector.detectMarkers, rows * columns, 4))
+        if np.isfinite(found[0]).mean() > 0.2:
+            break
+    tags = max(found, key=lambda corners: np.isfinite(corners).sum())
+    for turn in range(4):
+        # A tag's corners run clockwise: upper left, upper right, lower right, lower left.
+        cells = np.roll(tags, turn, 1)[:, [0, 1, 3, 2]].reshape(rows, columns, 2, 2, 2)
+        for way in (cells, cells[::-1]):
+            yield _shaped(way.swapaxes(1, 2), board)
 
 
 def _parameters(border: int = 1) -> cv2.aruco.DetectorParameters:
