@@ -181,7 +181,7 @@ def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] |
     if dark > 0.25 * middle:
         return None
     there = light > dark + max(4.0, 0.15 * (middle - dark))
-    rows, columns = there.any(1).nonzero()[0], there.any(0).nonzero()[0]
+    rows, columns = np.flatnonzero(there.any(1)), np.flatnonzero(there.any(0))
     x = [there.argmax(1)[rows], width - 1 - there[:, ::-1].argmax(1)[rows], columns, columns]
     y = [rows, rows, there.argmax(0)[columns], height - 1 - there[::-1].argmax(0)[columns]]
     rim = np.stack((np.concatenate(x), np.concatenate(y)), 1).astype(np.float64)
@@ -222,7 +222,18 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
                 grid = _shaped(corners.astype(np.float64), board)
                 turn = _cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
                 # A chessboard looks the same from its other end, but is never mirrored.
-                yield ((grid if turn.mean() > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
+                grid = grid if turn.mean() > 0 else grid[:, ::-1]
+                if _alternates(tried, grid):
+                    yield (grid + 0.5) / scale - 0.5
+
+
+def _alternates(grey: np.ndarray, grid: np.ndarray) -> bool:
+    """True if the squares between corners are dark and bright in turns."""
+    middles = (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1]).astype(np.float32) / 4
+    light = cv2.remap(grey.astype(np.float32), middles, None, cv2.INTER_LINEAR)
+    turns = (-1.0) ** np.add(*np.indices(light.shape))
+    steps = [(np.diff(light, axis=k) * np.delete(turns, 0, k)).ravel() for k in (0, 1)]
+    return len(set(np.sign(np.concatenate(steps)))) < 2
 
 
 def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:

@@ -17,7 +17,6 @@ from darswin.utils.files import replace_file
 from darswin.utils.parameters import check
 
 if TYPE_CHECKING:
-
     from darswin.calibrate import Board, Calibration
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
@@ -90,7 +89,7 @@ def calibrate(
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
 
-        save_figure(draw_calibration(found, lens), picture)
+        save_figure(draw_calibration(found, seen.corners, lens), picture)
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
@@ -152,10 +151,9 @@ class _Seen:
         self.without: list[str] = []
         self.corners: Any = []
         self.widths: list[float] = []
-        brightest = None
+        brightest = read_stored(files[0], 1)
         for name in files:
             image = read_stored(name, 1)
-            brightest = image if brightest is None else brightest
             if brightest.shape != image.shape:
                 (one, other) = (f"{a.shape[1]}×{a.shape[0]}" for a in (brightest, image))
                 raise ValueError(
@@ -171,8 +169,7 @@ class _Seen:
             else:
                 self.without.append(name)
             progress.done += 1
-        self.brightest: np.ndarray = brightest
-        self.size: tuple[int, int] = brightest.shape[:2]
+        self.brightest, self.size = brightest, (brightest.shape[0], brightest.shape[1])
         self.corners = np.array(self.corners)
 
     def circle(self) -> tuple[float, float, float] | None:
