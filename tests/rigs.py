@@ -92,7 +92,7 @@ def rig(
     height, width = (round(side) for side in lens.image_size[0].tolist())
     theta_max = lens.theta_max.item()
     middle = points.mean(0)
-    half = (points - middle).norm(dim=1).max()
+    half = (points - middle).norm(dim=1).max().clamp(min=0.01)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     while len(found) < pictures:
         u = torch.rand(7, generator=generator, dtype=f64)

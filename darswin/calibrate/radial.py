@@ -16,7 +16,7 @@ from torch import Tensor
 from darswin.lens.solve import length_of
 
 POWERS = (0, 2, 3, 4)  # of ρ in the depth g(ρ); a linear term would be a kink at the axis
-PRIOR = 0.04  # how far the principal point is expected from the middle, in parts of the side
+PRIOR = 0.02  # how far the principal point is expected from the middle, in parts of the side
 FLOOR = 0.05  # px: smaller residuals say nothing
 
 
