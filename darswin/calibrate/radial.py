@@ -16,7 +16,7 @@ from torch import Tensor
 from darswin.lens.solve import length_of
 
 POWERS = (0, 2, 3, 4)  # of ρ in the depth g(ρ); a linear term would be a kink at the axis
-PRIOR = 0.04  # how far the principal point is expected from the middle, in parts of the side
+PRIOR = 0.02  # how far the principal point is expected from the middle, in parts of the side
 FLOOR = 0.05  # px: smaller residuals say nothing
 
 
@@ -65,8 +65,9 @@ def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) 
         step, line = step / 3, torch.arange(-3, 4, dtype=corners.dtype)
     plane, error = (x[0] for x in misses(center[None]))
     found = Start(center, center, error)
-    counts = seen & found.fits[:, None]
-    return found._replace(depth=_depth(length_of(corners - center), counts, plane, board))
+    fits = found.fits
+    radius = length_of(corners - center)
+    return found._replace(depth=_depth(radius[fits], seen[fits], plane[fits], board))
 
 
 def _in_plane(flat: Tensor, seen: Tensor, board: Tensor) -> tuple[Tensor, Tensor]:
