@@ -16,7 +16,7 @@ Kind = Literal["chessboard", "charuco", "april"]
 Found = tuple[Sequence[np.ndarray], np.ndarray | None]  # corners, and their numbers
 
 SIDE = 1200  # px, to which larger pictures are reduced at first
-MOST_CHANGE = 0.45  # of a step between corners to the next, in steps; a rim of 125° has 0.33
+MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
 @dataclass(frozen=True)
@@ -218,22 +218,25 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     ):
         for tried, scale in _scales(grey):
             there, corners = detect(tried, (board.columns, board.rows), flags=flags)
-            if there:
-                grid = _shaped(corners.astype(np.float64), board)
+            if not there:
+                continue
+            grid = _shaped(corners.astype(np.float64), board)
+            # The outer ends of a smaller board's squares are no corners, a whole line of them.
+            if (~_are_saddles(tried, grid)).sum() < min(board.rows, board.columns) / 2:
                 turn = _cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
                 # A chessboard looks the same from its other end, but is never mirrored.
-                grid = grid if turn.mean() > 0 else grid[:, ::-1]
-                if _alternates(tried, grid):
-                    yield (grid + 0.5) / scale - 0.5
+                yield ((grid if turn.mean() > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
 
 
-def _alternates(grey: np.ndarray, grid: np.ndarray) -> bool:
-    """True if the squares between corners are dark and bright in turns."""
-    middles = (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1]).astype(np.float32) / 4
-    light = cv2.remap(grey.astype(np.float32), middles, None, cv2.INTER_LINEAR)
-    turns = (-1.0) ** np.add(*np.indices(light.shape))
-    steps = [(np.diff(light, axis=k) * np.delete(turns, 0, k)).ravel() for k in (0, 1)]
-    return len(set(np.sign(np.concatenate(steps)))) < 2
+def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """(rows, columns): True if two opposite squares at a corner are darker than the others."""
+    across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
+    both, other = across + down, across - down
+    a, b, c, d = (
+        cv2.remap(grey, (grid + aside).astype(np.float32), None, cv2.INTER_LINEAR)
+        for aside in (both, -both, other, -other)
+    )
+    return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))
 
 
 def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
