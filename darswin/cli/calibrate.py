@@ -137,7 +137,7 @@ class _Seen:
     """What the pictures show.
 
     Attributes: names, corners, widths: of the pictures with the board, and of its edges (px);
-    without: the other pictures; size: (H, W) of all; brightest: the maximum of all.
+    without: the other pictures; size: (H, W) of all; brightest: the maximum of those with it.
     """
 
     def __init__(self, files: Sequence[str], board: "Board", progress: Any):
@@ -160,9 +160,9 @@ class _Seen:
                     f"all pictures must have one size: {files[0]} has {one} (W×H) px, {name} has "
                     f"{other}"
                 )
-            brightest = np.maximum(brightest, image)
             corners = find_corners(image, board)
             if np.isfinite(corners).any():
+                brightest = np.maximum(brightest, image) if self.names else image
                 self.names.append(name)
                 self.corners.append(corners)
                 self.widths.append(edge_width(image, corners, board))
@@ -240,5 +240,5 @@ def _why(seen: _Seen, board: "Board", given: str) -> str:
             sizes.update([tuple(sorted(meta.shape, reverse=True))] if there else [])
         if sizes and (size := max(sizes, key=lambda size: (sizes[size], size))) > (3, 3):
             return f"{said} of --board {given}: they show {size[0]}x{size[1]} inner corners"
-    none = f", not {', '.join(seen.without)}" if seen.names else ""
+    none = f", not {', '.join(seen.without)}" if seen.names and seen.without else ""
     return f"{said}{none}: {LEAST} are needed, and 10 to 20 are better"

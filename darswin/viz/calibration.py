@@ -12,7 +12,7 @@ from darswin.lens import Lens
 from darswin.viz.plot import HATCH, TEXT, page_figure
 
 STEPS = 60  # of the map, along the image's longer side
-LONGEST = 0.12  # of the image's width: the arrow of a residual that 95 % do not exceed
+LONGEST = 0.08  # of the image's width: the arrow of a residual that 95 % do not exceed
 
 
 def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Figure:
@@ -23,13 +23,13 @@ def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Fig
         corners: (P, K, 2) px, as `calibrate` took them.
         lens: `found.lens`, perhaps with another θ_max.
     """
-    figure = page_figure(6.6)
+    figure = page_figure(6.4)
     panels = figure.subplot_mosaic([["corners", "residuals"], ["map", "curve"]])
     seen = ~torch.isnan(found.theta).numpy()
     places, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
     theta, counts = torch.rad2deg(found.theta).numpy()[seen], found.weights.numpy()[seen] > 0.1
     dots = panels["corners"].scatter(*places.T, c=theta, s=3, lw=0)
-    figure.colorbar(dots, ax=panels["corners"], location="bottom", label="θ (°)")
+    figure.colorbar(dots, ax=panels["corners"], location="bottom", pad=0.02, label="θ (°)")
     _draw_residuals(panels["residuals"], places, misses, counts, lens)
     _draw_map(panels["map"], found, lens)
     _draw_curve(panels["curve"], found, lens)
@@ -81,7 +81,7 @@ def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:
     most = spread.nanquantile(0.98).item()
     drawn = axes.imshow(spread.numpy(), extent=extent, vmin=0, vmax=most, cmap="magma_r")
     axes.patch.set(**HATCH)
-    axes.figure.colorbar(drawn, ax=axes, location="bottom", label="px", extend="max")
+    axes.figure.colorbar(drawn, ax=axes, location="bottom", pad=0.02, label="px", extend="max")
 
 
 def _draw_curve(axes: Axes, found: Calibration, lens: Lens) -> None:
