@@ -233,7 +233,7 @@ def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
     both, other = across + down, across - down
     a, b, c, d = (
-        cv2.remap(grey, (grid + aside).astype(np.float32), None, cv2.INTER_LINEAR)
+        cv2.remap(grey, *np.moveaxis(grid + aside, 2, 0).astype(np.float32), cv2.INTER_LINEAR)
         for aside in (both, -both, other, -other)
     )
     return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))

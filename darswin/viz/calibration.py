@@ -28,7 +28,7 @@ def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Fig
     seen = ~torch.isnan(found.theta).numpy()
     places, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
     theta, counts = torch.rad2deg(found.theta).numpy()[seen], found.weights.numpy()[seen] > 0.1
-    dots = panels["corners"].scatter(*places.T, c=theta, s=3, lw=0)
+    dots = panels["corners"].scatter(places[:, 0], places[:, 1], c=theta, s=3, lw=0)
     figure.colorbar(dots, ax=panels["corners"], location="bottom", pad=0.02, label="θ (°)")
     _draw_residuals(panels["residuals"], places, misses, counts, lens)
     _draw_map(panels["map"], found, lens)
