@@ -231,11 +231,13 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
 def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """(rows, columns): True if two opposite squares at a corner are darker than the others."""
     across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
+
+    def light(aside: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis((grid + aside).astype(np.float32), 2, 0)
+        return cv2.remap(grey, x, y, cv2.INTER_LINEAR)
+
     both, other = across + down, across - down
-    a, b, c, d = (
-        cv2.remap(grey, *np.moveaxis(grid + aside, 2, 0).astype(np.float32), cv2.INTER_LINEAR)
-        for aside in (both, -both, other, -other)
-    )
+    a, b, c, d = light(both), light(-both), light(other), light(-other)
     return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))
 
 
