@@ -179,7 +179,7 @@ def test_it_is_saved_and_described(usual, tmp_path):
 def test_lines_of_progress(usual):
     lines = []
     of(usual, progress=lines.append)
-    assert lines == ["Finding a start from 12 pictures", "Refining a KannalaBrandt lens"]
+    assert lines == ["Finding a start from 12 pictures", "Refining the lens: KannalaBrandt"]
 
 
 def test_the_best_model_predicts_left_out_pictures(usual):
