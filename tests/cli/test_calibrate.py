@@ -129,7 +129,7 @@ def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     line = refusal(capsys, *some, *BOARD)
     assert "2 of 2 pictures show the board: 3 are needed, and 10 to 20 are better" in line
     (folder / "empty").mkdir()
-    assert "missing pictures" in refusal(capsys, "empty", *BOARD)
+    assert "no pictures or videos in empty" in refusal(capsys, "empty", *BOARD)
     assert "missing pictures" in refusal(capsys, *BOARD)
     assert "no file or folder none" in refusal(capsys, "none", *BOARD)
     (folder / "broken.png").write_bytes((folder / "boards/0.png").read_bytes()[:2000])
