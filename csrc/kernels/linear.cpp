@@ -24,7 +24,7 @@ namespace {
 
 constexpr int64_t kL = kLanes<float>;
 constexpr int64_t kPart = 128;  // words of a token in a tile; this part of a panel has 24 KB
-constexpr int64_t kMostRows = 128, kBlockBytes = 1 << 18;  // of a block of tokens
+constexpr int64_t kMostRows = 128, kBlockBytes = 3 << 17;  // of a block of tokens
 
 // The kinds of products. X is the type of a token's numbers, Word that of a word in a tile, and Sum
 // that of a sum. A word of the layer becomes kSplit words in a tile. If kCopies, a tile reads a
@@ -278,7 +278,8 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
   using X = typename P::X;
   using Word = typename P::Word;
   typename Panel<P>::Sums sums[kMostRows * kPanel / kL];
-  // The block is small enough for its tokens to stay in the second-level cache.
+  // The block is small enough for its tokens to stay in the second-level cache. Each block reads
+  // the whole weight again, so small blocks lose where the weight is larger than the caches.
   const int64_t fitting = kBlockBytes / (a.depth * static_cast<int64_t>(sizeof(X)));
   const int64_t most = smaller(kMostRows, round_up(1 + fitting, kTileRows));
   const int64_t padded = padded_columns(a.columns), words = depth_words<X>(a.depth);

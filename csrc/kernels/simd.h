@@ -27,6 +27,24 @@ inline void fetch(const void* what) {
   asm volatile("");
 }
 
+// Stores a register past the caches, at a multiple of its size: for results that are too large to
+// be in a cache when they are read next. An ordinary store would first read the old values. Other
+// threads see the results after `finish_streams`.
+template <typename V, typename T>
+inline void stream(T* to, const V& v) {
+#if defined(__AVX__)
+  if constexpr (is_same_v<V, Floats>) {
+    return stream_lanes(to, v);
+  }
+#endif
+  store(to, v);
+}
+inline void finish_streams() {
+#if defined(__AVX__)
+  _mm_sfence();
+#endif
+}
+
 // Returns (1 - t) * a + t * b, given both weights. The form a + t * (b - a) would not do: the
 // difference of huge values overflows, and infinity minus anything but itself would become NaN
 // later on. The code fixes which of the two products is fused into the sum, so that every copy of

@@ -47,6 +47,14 @@ struct Attention {
     for (int64_t t = 0; t < shape.padded; ++t) s.copy[t] = (t < shape.n ? t : 0) * shape.d;
   }
 
+  // True if backward stores the gradients past the caches: the caches cannot hold the map, and each
+  // number is stored once, in a whole register.
+  bool streams() const {
+    const auto address = reinterpret_cast<uintptr_t>(a.grad_qkv);
+    return sizeof(S) == sizeof(T) && shape.far && shape.n <= kGroup && shape.d % kLanes<T> == 0 &&
+           address % kRegister == 0;
+  }
+
   // Returns the number of queries in the group that begins at query `group`.
   int64_t group_size(int64_t group) const { return smaller(shape.n - group, kGroup); }
 
@@ -247,7 +255,7 @@ struct Attention {
       weights(group);
       if (to != nullptr) fetch(to, s.next.out, group);
       weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), group_size(group),
-                    shape.d, Factors<T>{s.inverse, 1}, false);
+                    shape.d, Factors<T>{s.inverse, 1}, Into::kCache);
     }
     if (to != nullptr) return finish(to, s.window.out, s.dq_copy);
     if constexpr (is_same_v<S, float>) {
@@ -267,6 +275,7 @@ struct Attention {
     const Rows<T> dk = write(to + part, s.window.in, s.dk_copy);
     const Rows<T> dv = write(to + 2 * part, s.window.in, s.dv_copy);
     const T unit = 1;
+    const bool past = streams();
     const Factors<T> scale{&a.scale, 0}, one{&unit, 0};
     for (int64_t group = 0; group < shape.n; group += kGroup) {
       const auto n = shape.n;
@@ -274,18 +283,19 @@ struct Attention {
       const int64_t queries = group_size(group);
       const Weights<kGroup, 1, T> p{s.p}, ds{s.dp};
       const Weights<1, kGroup, T> ds_of_query{s.dp};
-      const bool add = group > 0;
+      const Into first = past ? Into::kMemory : Into::kCache;
+      const Into into = group > 0 ? Into::kSum : first;
       weights(group);
       fetch(from, s.next.out, group);
       transpose(g.from(group), d, s.columns);
       probability_gradients();
       softmax_backward(group, grad_bias);
-      fetch(to + 2 * part, s.next.in, group);
-      weighted_sums(p, g.from(group), queries, dv, n, d, one, add);
-      fetch(to + part, s.next.in, group);
-      weighted_sums(ds, q.from(group), queries, dk, n, d, scale, add);
-      fetch(to, s.next.in, group);
-      weighted_sums(ds_of_query, k, n, dq.from(group), queries, d, scale, false);
+      if (!past) fetch(to + 2 * part, s.next.in, group);
+      weighted_sums(p, g.from(group), queries, dv, n, d, one, into);
+      if (!past) fetch(to + part, s.next.in, group);
+      weighted_sums(ds, q.from(group), queries, dk, n, d, scale, into);
+      if (!past) fetch(to, s.next.in, group);
+      weighted_sums(ds_of_query, k, n, dq.from(group), queries, d, scale, first);
     }
     finish(to, s.window.in, s.dq_copy);
     finish(to + part, s.window.in, s.dk_copy);
@@ -317,6 +327,7 @@ struct Attention {
       backward_chunk(row + first, row + smaller(first + a.chunk, row_windows), head, last,
                      a.grad_bias + (chunk * shape.heads + head) * shape.table);
     });
+    finish_streams();
   }
 
   // Takes windows [begin, end) and heads [first, last). grad_bias has one row for each of these

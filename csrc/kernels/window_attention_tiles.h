@@ -97,10 +97,14 @@ struct Factors {
   Factors from(int64_t i) const { return {factor + i * step, step}; }
 };
 
+// How results are stored: in place of the old values, added to them, or in place of them and past
+// the caches.
+enum class Into { kCache, kSum, kMemory };
+
 // Computes channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
 template <typename V, int kRows, int kColumns, typename W, typename T>
 inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
-                          Factors<T> factors, bool add) {
+                          Factors<T> factors, Into into) {
   constexpr int kL = sizeof(V) / sizeof(T);
   V sums[kRows][kColumns] = {};
   for (int64_t j = 0; j < summands; ++j) {
@@ -121,28 +125,28 @@ inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<
     for (int v = 0; v < kColumns; ++v) {
       T* out = to[r] + v * kL;
       V sum = sums[r][v] * splat<V>(factors(r));
-      if (add) sum += load<V>(out);
-      store(out, sum);
+      if (into == Into::kSum) sum += load<V>(out);
+      into == Into::kMemory ? stream(out, sum) : store(out, sum);
     }
   }
 }
 
-// Computes to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows. If `add` is true,
-// adds this to the old values. Weights are read up to the next multiple of 8 rows. Long sums are
-// cut into pieces, because the rounding error of a sum grows with its length.
+// Computes to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows. Weights are
+// read up to the next multiple of 8 rows. Long sums are cut into pieces, because the rounding error
+// of a sum grows with its length. Only sums of one piece can be stored past the caches.
 template <typename W, typename T, typename Summands, typename Count, typename Dim>
 __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summands summands,
                                              Rows<T> to, Count rows, Dim d, Factors<T> factors,
-                                             bool add) {
+                                             Into into) {
   constexpr int kL = kLanes<T>, kRows = kTileRows, kPiece = 64;
-  for (int64_t j = 0; j < summands; j += kPiece, add = true) {
+  for (int64_t j = 0; j < summands; j += kPiece, into = Into::kSum) {
     const int64_t piece = smaller(summands - j, kPiece);
     for (int64_t i = 0; i < rows; i += kRows) {
       const auto tile = [&]<typename V, int kColumns>(int64_t c) {
         const Rows<const T> source{from.base + c, from.offset + j};
         const Rows<T> target{to.base + c, to.offset + i};
         weighted_tile<V, kRows, kColumns>(weights.from(i, j), source, piece, target, rows - i,
-                                          factors.from(i), add);
+                                          factors.from(i), into);
       };
       int64_t c = 0;
       for (; c + 2 * kL <= d; c += 2 * kL) tile.template operator()<Vector<T, kL>, 2>(c);

@@ -1,9 +1,7 @@
-"""Edges of pictures as curves with subpixel points, and the circle in which a lens shows a picture.
+"""The edges of a picture as curves with subpixel points.
 
 Source: Canny, PAMI 1986; Devernay, INRIA RR-2724, 1995.
 """
-
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -14,7 +12,6 @@ LEAST = 0.5  # grey levels per px, of the stronger threshold
 TURN = 0.8  # the least cosine between the gradients of neighbours on a curve
 SHORTEST = 0.035  # of the picture's diagonal
 APART = 1.0  # px, the largest distance of a point from the circle of its curve
-DARK = 12  # grey levels, at most, outside the image circle
 
 
 def curves(picture: np.ndarray) -> list[np.ndarray]:
@@ -113,31 +110,3 @@ def _from_circle(points: np.ndarray) -> np.ndarray:
     a, b, c, d = np.linalg.svd(rows, full_matrices=False)[2][-1]
     slope = np.hypot(2 * a * x + b, 2 * a * y + c)
     return scale * np.abs(rows @ (a, b, c, d)) / np.maximum(slope, 1e-9)
-
-
-def image_circle(pictures: Sequence[np.ndarray]) -> tuple[float, float, float] | None:
-    """The circle (x, y, radius) in px in which a lens shows its pictures on a dark sensor; None if
-    they fill the sensor."""
-    greys = [p.max(-1) if p.ndim == 3 else p for p in pictures]
-    lit = (cv2.medianBlur(np.max(greys, 0), 5) > DARK).astype(np.uint8)
-    outlines, _ = cv2.findContours(lit, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if not outlines or lit.all():
-        return None
-    outline = cv2.convexHull(max(outlines, key=cv2.contourArea))[:, 0].astype(float)
-    last = np.array(lit.shape[::-1]) - 1
-    inside = outline[((outline > 2) & (outline < last - 2)).all(1)]
-    if len(inside) < 12:
-        return None
-    for _ in range(5):
-        (x, y, c), *_ = np.linalg.lstsq(
-            np.column_stack((2 * inside, np.ones(len(inside)))), (inside**2).sum(1), rcond=None
-        )
-        radius = np.sqrt(max(c + x * x + y * y, 0.0))
-        off = np.abs(np.hypot(*(inside - (x, y)).T) - radius)
-        if off.max() < 0.01 * radius:
-            break
-        inside = inside[off <= max(np.quantile(off, 0.8), 1.0)]
-    around = np.unique(np.arctan2(*(inside - (x, y)).T) // (np.pi / 8))
-    if len(around) < 6 or off.max() > 0.01 * radius or radius > np.hypot(*lit.shape) / 2:
-        return None
-    return float(x), float(y), float(radius)

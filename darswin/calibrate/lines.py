@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from darswin.calibrate import edges
+from darswin.calibrate.boards import image_circle
 from darswin.calibrate.calibration import CalibrationError
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
@@ -88,7 +89,7 @@ def estimate(
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
         raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
-    circle = edges.image_circle(pictures)
+    circle = image_circle(pictures)
     if fov is not None and circle is None:
         raise CalibrationError("no image circle is visible, so its field of view says nothing")
     found_curves = []

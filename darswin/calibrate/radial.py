@@ -13,10 +13,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from darswin.calibrate.inputs import CalibrationError
+from darswin.lens import Lens, OCam, Tabulated
+from darswin.lens.fitting import fit_one
+from darswin.lens.ideal import FocalLens
 from darswin.lens.solve import length_of
 
 POWERS = (0, 2, 3, 4)  # of ρ in the depth g(ρ); a linear term would be a kink at the axis
-PRIOR = 0.04  # how far the principal point is expected from the middle, in parts of the side
+PRIOR = 0.02  # how far the principal point is expected from the middle, in parts of the side
+TABLE = 12  # the steps of a table
 FLOOR = 0.05  # px: smaller residuals say nothing
 
 
@@ -42,6 +47,30 @@ class Start(NamedTuple):
             depth = depth * length_of(flat) + coefficient
         return torch.nn.functional.normalize(torch.cat((flat, depth[..., None]), -1), dim=-1)
 
+    def lens(self, model: type[Lens], terms: int | None, top: float, size: tuple[int, int]) -> Lens:
+        """The lens of a model that is close to the curve up to the angle `top`, rad."""
+        end = model._end if issubclass(model, FocalLens) else math.pi
+        if top > end + 0.05:
+            raise CalibrationError(
+                f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
+                f"lens ends at {math.degrees(end):.0f}°: choose another model."
+            )
+        image = {"center": self.center[None], "image_size": self.center.new_tensor([size])}
+        curve = OCam(-self.depth[None], **image)
+        limit = curve.theta_limit.item()
+        if issubclass(model, Tabulated):
+            last = min(1.03 * top + 0.02, limit)
+            angles = torch.linspace(0, last, (terms or TABLE) + 1).to(self.center)
+            return Tabulated(angles, curve.project(angles), **image)
+        for share in (1.0, 0.9, 0.7, 0.5):
+            short = curve.with_theta_max(share * min(top, limit, 0.97 * end))
+            try:
+                found = fit_one(model, short, terms or model.terms, rounds=20)._tensors()
+                return model(**found | image | {"theta_max": None})
+            except ValueError:
+                continue
+        raise CalibrationError(f"No {model.__name__} lens is close to the start.")
+
 
 def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) -> Start:
     """The start from corners (P, K, 2) px, of which `seen` (P, K) count, of points (K, 2)."""
@@ -65,8 +94,9 @@ def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) 
         step, line = step / 3, torch.arange(-3, 4, dtype=corners.dtype)
     plane, error = (x[0] for x in misses(center[None]))
     found = Start(center, center, error)
-    counts = seen & found.fits[:, None]
-    return found._replace(depth=_depth(length_of(corners - center), counts, plane, board))
+    fits = found.fits
+    radius = length_of(corners - center)
+    return found._replace(depth=_depth(radius[fits], seen[fits], plane[fits], board))
 
 
 def _in_plane(flat: Tensor, seen: Tensor, board: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,42 +130,37 @@ def _depth(radius: Tensor, seen: Tensor, plane: Tensor, board: Tensor) -> Tensor
     gap = second.square().sum(-1) - first.square().sum(-1)
     tilt = torch.complex(gap, -2 * (first * second).sum(-1)).sqrt()
     scale = (first.square().sum(-1) + tilt.real.square()).sqrt()
-    tilt = torch.view_as_real(tilt / scale[:, None].squeeze(-1))
+    tilt = torch.view_as_real(tilt / scale)
     across = length_of(board @ plane.mT) / scale[:, None]
     leaning = tilt @ board[:, :2].T
     unit = torch.where(seen, radius, 0).max()
     rho = torch.where(seen, radius / unit, 0)
     # Boards almost parallel to the sensor say little: rounding decides their tilt.
     steep = tilt.square().sum(-1)
-    picture = steep / (steep + 0.01) / across.amax(1).square()
+    sure = seen * (steep / (steep + 0.01))[:, None]
     line = torch.linspace(0, 1, 200, dtype=rho.dtype)
     for terms in range(len(POWERS), 0, -1):
         powers = torch.tensor(POWERS[:terms], dtype=rho.dtype)
-        weight = seen * picture[:, None]
+        weight = sure / across.amax(1, keepdim=True).square()
         for _ in range(3):
             columns = across[..., None] * rho[..., None] ** powers
             known = rho * leaning
             # Each picture's Z is eliminated.
-            norm = (weight * rho * rho).sum(1).clamp(min=1e-30)
-            along = (weight * rho)[..., None]
-            columns = columns - rho[..., None] * ((along * columns).sum(1) / norm[:, None])[:, None]
-            known = known - rho * ((along[..., 0] * known).sum(1) / norm)[:, None]
+            along = weight * rho / (weight * rho * rho).sum(1, keepdim=True).clamp(min=1e-30)
+            columns = columns - rho[..., None] * torch.einsum("pk,pkm->pm", along, columns)[:, None]
+            known = known - rho * (along * known).sum(1, keepdim=True)
             right = torch.einsum("pk,pkm,pk->pm", weight, columns, known)
             left = torch.einsum("pk,pkm,pkn->mn", weight, columns, columns)
             left = left + 1e-12 * left.diagonal().mean() * torch.eye(terms, dtype=rho.dtype)
-            signs = _signs(right, torch.linalg.solve(left, right.T))
-            solved = torch.linalg.solve(left, right.T @ signs)
-            solved, signs = (solved, signs) if solved[0] > 0 else (-solved, -signs)
+            solved = torch.linalg.solve(left, right.T)
+            solved = solved @ _signs(right, solved)
+            solved = solved if solved[0] > 0 else -solved
             # A shift of ρ by one changes the equation by Z - √(X² + Y²) g′(ρ).
             depth = (rho[..., None] ** powers) @ solved
             bends = (powers * rho[..., None].clamp(min=1e-6) ** (powers - 1)) @ solved
             far = across * (depth / rho.clamp(min=1e-6) - bends)
             typical = torch.where(seen, far.abs(), torch.nan).nanmedian(1, keepdim=True).values
-            weight = (
-                seen
-                * (steep / (steep + 0.01))[:, None]
-                / far.square().clamp(min=0.05 * typical.square())
-            )
+            weight = sure / far.square().clamp(min=0.05 * typical.square())
         angle = torch.atan2(line, (line[:, None] ** powers) @ solved)
         if solved[0] > 0 and bool((angle.diff() > 0).all()):
             break

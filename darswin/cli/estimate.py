@@ -5,11 +5,8 @@ import math
 import sys
 from collections.abc import Sequence
 
-import numpy as np
-
-import darswin.lens
 from darswin.cli.arguments import check_out
-from darswin.utils.exif import TURNS
+from darswin.cli.calibrate import write_lens
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check
 
@@ -34,7 +31,7 @@ def estimate(
     # These import OpenCV and Pillow, which other commands of `lens` do not need.
     from darswin.calibrate import estimate as estimate_lens
     from darswin.cli.predict import check_paths, pictures_and_videos
-    from darswin.utils.image import read_oriented
+    from darswin.utils.image import read_stored
 
     if not pictures:
         raise ValueError("missing pictures: give files or folders")
@@ -46,15 +43,8 @@ def estimate(
         raise ValueError(f"no pictures in {', '.join(pictures)}")
     for written in filter(None, (out, report)):
         check_out(written, files)
-    images = []
-    for file in files:
-        image, orientation = read_oriented(file)
-        swapped, right, down = TURNS[orientation]
-        image = image[:: -1 if down else 1, :: -1 if right else 1]
-        # A calibration is of pictures as they are stored.
-        images.append(np.ascontiguousarray(image.swapaxes(0, 1) if swapped else image))
     found = estimate_lens(
-        images,
+        [read_stored(file) for file in files],
         model,
         center=center,
         fov=None if fov_deg is None else math.radians(fov_deg),
@@ -66,6 +56,4 @@ def estimate(
     if report is not None:
         replace_file(report, json.dumps(found.to_dict() | {"pictures": files}, indent=1) + "\n")
     if out is not None:
-        written = darswin.lens.save(found.lens, out)
-        degrees = math.degrees(found.lens.theta_max.item())
-        print(f"{out}: {written}, {type(found.lens).__name__} up to {degrees:.2f}°")
+        write_lens(found.lens, out, None)

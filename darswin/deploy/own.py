@@ -34,7 +34,7 @@ def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
 
 
 def packed_weights(linear: Any) -> Tensor:
-    """A linear layer as `_linear` and `_blocks_` read it, (K,): float32, or int32 if quantized."""
+    """A linear layer as `_linear` reads it, (K,): float32, or int32 if quantized."""
     weight = linear.weight.detach()
     bias = None if linear.bias is None else linear.bias.detach().float()
     if (taken := taken_by(linear)) is not None:

@@ -88,7 +88,11 @@ def call(
     compiled = isinstance(first, Tensor) and first.is_cpu and not _reference
     if compiled and not torch.compiler.is_compiling():
         try:
-            return operator(*arguments)
+            if torch.is_inference_mode_enabled() or _may_be_derived(arguments):
+                return operator(*arguments)
+            # The same, without the step into `differentiable`, which takes as long as the rest.
+            with torch._C._AutoDispatchBelowAutograd():
+                return operator(*arguments)
         except RuntimeError:
             try:
                 explain(*arguments)
@@ -107,6 +111,17 @@ def call(
 
 
 # -- derivatives -----------------------------------------------------------------------------------
+
+
+def _may_be_derived(arguments: Sequence[Any]) -> bool:
+    """True if a gradient is recorded, or another derivative may be asked for."""
+    if forward_ad._current_level >= 0 or transformed():
+        return True
+    if torch.is_grad_enabled():
+        for value in arguments:
+            if isinstance(value, Tensor) and value.requires_grad:
+                return True
+    return False
 
 
 def register_gradients(name: str, groups: dict[int, int]) -> None:

@@ -56,6 +56,19 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     return np.ascontiguousarray(image[down, across]), orientation
 
 
+def read_stored(path: str | Path, channels: int = 3) -> np.ndarray:
+    """`read_image` with the pixels as the camera stores them, which a calibration describes.
+
+    Raises:
+        BrokenImageError: see `read_oriented`.
+    """
+    image, orientation = read_oriented(path, channels)
+    swapped, *reversed_ = TURNS[orientation]
+    across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
+    image = image[down, across]
+    return np.ascontiguousarray(image.swapaxes(0, 1) if swapped else image)
+
+
 def written_as(path: Path) -> Path:
     """The name that `write_image` can write: other endings get .png in addition."""
     return path if path.suffix.lower() in WRITTEN else path.with_name(f"{path.name}.png")

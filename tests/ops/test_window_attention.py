@@ -56,6 +56,25 @@ def test_minus_infinity_in_the_bias_hides_a_pair(reference):
     torch.testing.assert_close(out[0, 0, 0], qkv[0, 0, 0, 2, 0])
 
 
+@pytest.mark.parametrize(
+    ("dim", "window"), [(32, (1, 16)), (24, (1, 8)), (33, (1, 16)), (32, (2, 16))]
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_map_beyond_the_caches_gives_the_gradients_of_its_parts(dim, window, dtype):
+    # The gradients of a large map may be stored past the caches, those of one image never are.
+    qkv, bias = arguments(32, 8, 64, 3, dim, window, dtype=dtype)
+    assert qkv.nbytes > 2**22 > qkv[0].nbytes
+
+    def gradient(images):
+        images = images.clone().requires_grad_()
+        out = window_attention(images, bias, window=window, shift=(0, 4))
+        out.backward(torch.linspace(-1, 1, dim).repeat(3).to(dtype).expand_as(out))
+        return images.grad
+
+    parts = [gradient(qkv[k : k + 1]) for k in range(len(qkv))]
+    assert torch.equal(gradient(qkv), torch.cat(parts))
+
+
 @pytest.mark.slow  # it writes 3 GB
 def test_indices_beyond_two_to_the_31():
     # Only the output (3 GB) needs memory: the pages of a new tensor are allocated when they are

@@ -30,6 +30,8 @@ inline Doubles whole_part(Doubles x) {
   return (Doubles)_mm256_round_pd((__m256d)x, _MM_FROUND_TO_ZERO | _MM_FROUND_NO_EXC);
 }
 
+inline void stream_lanes(float* to, Floats v) { _mm256_stream_ps(to, (__m256)v); }
+
 inline Floats widen_lanes(const bfloat16* from) {
   const auto bits = (Vector<uint32_t, 8>)_mm256_cvtepu16_epi32(load_bits<__m128i>(from));
   return (Floats)(bits << 16);

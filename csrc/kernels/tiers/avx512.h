@@ -36,6 +36,8 @@ inline Doubles whole_part(Doubles x) {
   return (Doubles)_mm512_maskz_roundscale_pd(0xFF, (__m512d)x, _MM_FROUND_TO_ZERO);
 }
 
+inline void stream_lanes(float* to, Floats v) { _mm512_stream_ps(to, (__m512)v); }
+
 inline Floats widen_lanes(const bfloat16* from) {
   const __m256i halves = load_bits<__m256i>(from);
   return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);

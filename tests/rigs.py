@@ -5,6 +5,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from numpy.polynomial import Polynomial
 from torch import Tensor
 
 from darswin.lens import MODELS, EnhancedUnified, Lens, fit
@@ -13,6 +14,11 @@ from darswin.lens.solve import vector_of
 f64 = torch.float64
 # The widest field of view, degrees, that a model shows well.
 WIDEST = {"Perspective": 120, "BrownConrady": 120, "Orthographic": 170}
+OFF_CURVE = {
+    "BrownConrady": {"tangential": 2},
+    "Mei": {"tangential": 2},
+    "Fisheye624": {"tangential": 2, "prism": 4},
+}
 
 
 class Rig(NamedTuple):
@@ -44,16 +50,17 @@ def true_lens(
         torch.tensor([0.4 + 0.2 * alpha], dtype=f64), 0.9 + 0.4 * beta, math.radians(fov),
         min(size) / 2,
     )  # fmt: skip
-    lens = fit(MODELS[model], base).lens
-    center = torch.tensor(
-        [
-            [
-                size[1] * (0.5 + shift * (2 * x - 1)) - 0.5,
-                size[0] * (0.5 + shift * (2 * y - 1)) - 0.5,
-            ]
-        ],
-        dtype=f64,
-    )
+    lens = fit(MODELS["Polynomial" if model == "OCamInverse" else model], base).lens
+    if model == "OCamInverse":  # of a fit, r(0) is not 0
+        shifted = Polynomial([0, *lens.coefficients[0].tolist()])(Polynomial([math.pi / 2, 1]))
+        lens = MODELS[model](torch.from_numpy(shifted.coef), base.theta_max)
+    for name, count in OFF_CURVE.get(model, {}).items():
+        off = 2e-3 * (2 * torch.rand(1, count, generator=generator, dtype=f64) - 1)
+        lens = lens.replace(**{name: off})
+    lens = lens.with_theta_max(torch.minimum(lens.theta_max, 0.98 * lens.theta_limit))
+    sides = torch.tensor([size[1], size[0]], dtype=f64)
+    off = 2 * torch.tensor([x, y], dtype=f64) - 1
+    center = ((sides - 1) / 2 + shift * off * sides)[None]
     return lens.replace(center=center, image_size=torch.tensor([size], dtype=f64))
 
 
@@ -82,7 +89,7 @@ def rig(
     height, width = (round(side) for side in lens.image_size[0].tolist())
     theta_max = lens.theta_max.item()
     middle = points.mean(0)
-    half = (points - middle).norm(dim=1).max()
+    half = (points - middle).norm(dim=1).max().clamp(min=0.01)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     while len(found) < pictures:
         u = torch.rand(7, generator=generator, dtype=f64)
