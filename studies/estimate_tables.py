@@ -20,7 +20,7 @@ def publish(record: dict, folder: Path) -> None:
 
 
 def _error(result: dict) -> str:
-    return "refused" if "refused" in result else f"{result['error']:+.1f}"
+    return "refused" if "refused" in result else f"{round(result['error'], 1) + 0:+.1f}"
 
 
 def _range(result: dict) -> str:
@@ -32,6 +32,10 @@ def _range(result: dict) -> str:
 
 def _found(results: Iterable[dict]) -> list[dict]:
     return [result for result in results if "refused" not in result]
+
+
+def _sure(results: Iterable[dict]) -> list[dict]:
+    return [result for result in _found(results) if not result["doubts"]]
 
 
 def _near(results: Iterable[dict], percent: float) -> int:
@@ -69,14 +73,14 @@ def singles(record: dict) -> str:
         every.append(single)
         results = single[SHOWN]
         found = _found(results)
-        sure = [result for result in found if not result["doubts"]]
+        sure = _sure(results)
         rows.append([
             of["name"] if of else "all",
             *(_middle(_found(single[model])) for model in MODELS),
             f"{_near(found, RIM_OF_ONE)}/{len(results)}",
             f"{_near(sure, RIM_OF_ONE)}/{len(sure)}",
             f"{sum(result['holds'] for result in found)}/{len(found)}",
-            len(results) - len(found),
+            str(len(results) - len(found)),
         ])  # fmt: skip
     within = f"within {RIM_OF_ONE:.0f} %"
     header = [within, f"{within}, no doubts", "interval holds θ", "refused"]
@@ -103,7 +107,7 @@ def real(record: dict) -> str:
     """A row a camera."""
     rows = [
         [
-            of["camera"], of["pictures"], f"{_true(of['all']):.1f}",
+            of["camera"], str(of["pictures"]), f"{_true(of['all']):.1f}",
             *(_error(of["all"][model]) for model in MODELS), _range(of["all"][SHOWN]),
             "; ".join(of["all"][SHOWN].get("doubts", ())) or "none",
         ]
@@ -119,6 +123,7 @@ def targets(record: dict) -> str:
     for model in MODELS[:2]:
         found = _found(of["all"][model] for of in lenses)
         alone = [result for of in lenses for result in of["single"][model]]
+        sure = _sure(alone)
         lost = [
             of["digits"]["true"] - of["digits"]["estimated"][model]
             for of in lenses
@@ -130,6 +135,11 @@ def targets(record: dict) -> str:
                 model,
                 f"θ within {RIM_OF_ONE:.0f} %, one picture",
                 f"{_near(_found(alone), RIM_OF_ONE)}/{len(alone)}",
+            ],
+            [
+                model,
+                f"θ within {RIM_OF_ONE:.0f} %, one picture that gives no doubts",
+                f"{_near(sure, RIM_OF_ONE)}/{len(sure)}",
             ],
             [
                 model,
