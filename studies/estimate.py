@@ -26,25 +26,14 @@ from worlds.scene import Scene
 from worlds.textures import Textures
 from worlds.wad import load_map, map_names
 
+from darswin import lens as kinds
 from darswin import load_model
 from darswin.calibrate import CalibrationError, lines
 from darswin.calibrate.boards import image_circle
 from darswin.calibrate.edges import curves
 from darswin.data import warp_map
 from darswin.data.warping import remap
-from darswin.lens import (
-    BrownConrady,
-    Equidistant,
-    Equisolid,
-    FieldOfView,
-    KannalaBrandt,
-    Lens,
-    Perspective,
-    Spherical,
-    Stereographic,
-    load,
-    to_dict,
-)  # fmt: skip
+from darswin.lens import Lens, Perspective
 
 SIZE = (480, 640)
 MIDDLE = ((SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2)
@@ -52,20 +41,21 @@ CIRCLE = 234.0  # px: the radius of image circles, and of the circle that a digi
 SHIFT = 3.0  # px: centres are up to this far from the middle, along each axis
 NOISE = 2.0  # of 255: the standard deviation of pixels
 SAMPLES = 2  # of a pixel, along each axis
+LONG = 0.3  # of the radius: the length of a long curve
 DIGIT, WIDEST = 32, math.radians(82.5)  # px; rad: the largest θ of the digits' training
 DATA = Path("/usr/share/doc/opencv-doc/examples/data")
 
 # Of each lens: the class, its parameters, its field of view in degrees, and whether an image
 # circle shows it. Otherwise the field of view fills the width.
 LENSES: dict[str, tuple[type[Lens], dict, float, bool]] = {
-    "Spherical, ξ = 0.3": (Spherical, dict(xi=[0.3]), 125, False),
-    "Spherical, ξ = 0.8": (Spherical, dict(xi=[0.8]), 170, True),
-    "KannalaBrandt, 150°": (KannalaBrandt, dict(radial=[[-0.03, 0.004]]), 150, False),
-    "KannalaBrandt, 200°": (KannalaBrandt, dict(radial=[[0.02, -0.008]]), 200, True),
-    "Equidistant": (Equidistant, {}, 140, False),
-    "Equisolid": (Equisolid, {}, 185, True),
-    "Stereographic": (Stereographic, {}, 150, False),
-    "FieldOfView": (FieldOfView, dict(omega=[0.9]), 130, False),
+    "Spherical, ξ = 0.3": (kinds.Spherical, dict(xi=[0.3]), 125, False),
+    "Spherical, ξ = 0.8": (kinds.Spherical, dict(xi=[0.8]), 170, True),
+    "KannalaBrandt, 150°": (kinds.KannalaBrandt, dict(radial=[[-0.03, 0.004]]), 150, False),
+    "KannalaBrandt, 200°": (kinds.KannalaBrandt, dict(radial=[[0.02, -0.008]]), 200, True),
+    "Equidistant": (kinds.Equidistant, {}, 140, False),
+    "Equisolid": (kinds.Equisolid, {}, 185, True),
+    "Stereographic": (kinds.Stereographic, {}, 150, False),
+    "FieldOfView": (kinds.FieldOfView, dict(omega=[0.9]), 130, False),
 }
 
 
@@ -73,7 +63,7 @@ def lens_of(name: str) -> Lens:
     """A true lens, with a centre near the middle."""
     kind, numbers, fov, circle = LENSES[name]
     rng = np.random.default_rng([*name.encode()])
-    center = torch.tensor(MIDDLE, dtype=torch.float64) + rng.uniform(-SHIFT, SHIFT, 2)
+    center = torch.from_numpy(MIDDLE + rng.uniform(-SHIFT, SHIFT, 2))
     given = {key: torch.tensor(value, dtype=torch.float64) for key, value in numbers.items()}
     half = math.radians(fov / 2)
     unit = kind(focal=torch.ones(1, dtype=torch.float64), **given).with_theta_max(None)
@@ -179,8 +169,8 @@ def wrong_lenses(true: Lens) -> dict[str, Lens]:
     where = dict(radius=CIRCLE, center=torch.tensor([MIDDLE]), image_size=SIZE)
     return {
         "perspective": Perspective.from_fov(math.radians(100), **where),
-        "equidistant, 180°": Equidistant.from_fov(math.pi, **where),
-        "equidistant, true fov": Equidistant.from_fov(2 * angle(true, CIRCLE), **where),
+        "equidistant, 180°": kinds.Equidistant.from_fov(math.pi, **where),
+        "equidistant, true fov": kinds.Equidistant.from_fov(2 * angle(true, CIRCLE), **where),
     }
 
 
@@ -206,20 +196,22 @@ def study(name: str, count: int) -> dict:
     )
     seconds = dict(render=rendered - start, all=from_all - rendered, rest=time.process_time())
     seconds["rest"] -= from_all
+    long = [sum(len(curve) > LONG * CIRCLE for curve in of) for of in found]
     return dict(
         name=name, circle=LENSES[name][3], fov=2 * math.degrees(angle(true, CIRCLE)),
-        lens=to_dict(true), all=results, single=single, digits=scores, seconds=seconds,
+        lens=kinds.to_dict(true), all=results, single=single, long=long, digits=scores,
+        seconds=seconds,
     )  # fmt: skip
 
 
 def published(camera: str) -> Lens:
     """The calibration that OpenCV ships for its pictures."""
     if camera == "left":
-        return load(DATA / "left_intrinsics.yml").to(torch.float64)
+        return kinds.load(DATA / "left_intrinsics.yml").to(torch.float64)
     file = cv2.FileStorage(str(DATA / "intrinsics.yml"), cv2.FILE_STORAGE_READ)
     matrix, (k1, k2, p1, p2, k3) = file.getNode("M2").mat(), file.getNode("D2").mat().ravel()[:5]
     t = lambda *numbers: torch.tensor([numbers], dtype=torch.float64)  # noqa: E731
-    return BrownConrady(
+    return kinds.BrownConrady(
         focal=t(matrix[0, 0])[0], radial=t(k1, k2, k3), tangential=t(p1, p2),
         center=t(*matrix[:2, 2]), image_size=SIZE,
     )  # fmt: skip
