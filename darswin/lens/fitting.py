@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import torch
@@ -15,6 +15,7 @@ from darswin.lens.solve import direction_of
 
 # The grid of rays that are compared.
 RINGS, SPOKES = 200, 16
+ROUNDS = 200
 
 
 class Fit(NamedTuple):
@@ -54,7 +55,7 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         return Fit(curves, largest_distance(curves, lens))
     terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
-    found = cat([_fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
+    found = cat([fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
     fitted = model(**found | {name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
@@ -74,7 +75,9 @@ def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
     return theta[..., None], direction_of(azimuth)[None, None]
 
 
-def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
+def fit_one(model: type[Lens], lens: Lens, terms: int, rounds: int = ROUNDS) -> Lens:
+    """`fit` of one lens in float64, without the parameters that all lenses have but theta_max, in
+    at most `rounds` steps from each start."""
     # A radial lens needs one azimuth only.
     aside = not lens.is_radial and "tangential" in model.optional
     theta, direction = _rays(lens, RINGS, SPOKES if aside else 1)
@@ -85,7 +88,7 @@ def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
     found = (
-        _least_squares(model, start, lens.theta_max, theta, direction, goal)
+        _least_squares(model, start, lens.theta_max, theta, direction, goal, rounds)
         for start in _starts(model, lens, terms, aside)
     )
     best, cost = min(found, key=lambda pair: pair[1])
@@ -111,6 +114,30 @@ def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[
         yield start
 
 
+class Packing:
+    """Parameters of one lens as one vector: names and shapes are those of tensors (1, ...). `low`
+    and `high` bound its numbers in a fit."""
+
+    def __init__(self, model: type[Lens], tensors: Mapping[str, Tensor]):
+        self.shapes = {name: tensor.shape for name, tensor in tensors.items()}
+        declared = {name: model.declared[name] for name in tensors}
+        bounds = {name: p.bounds or (p.low, p.high) for name, p in declared.items()}
+        self.low, self.high = (
+            self.vector({n: t.new_full(t.shape, bounds[n][end]) for n, t in tensors.items()})
+            for end in (0, 1)
+        )
+
+    def vector(self, tensors: Mapping[str, Tensor]) -> Tensor:
+        """The numbers of the tensors, one after the other."""
+        return torch.cat([tensors[name].flatten() for name in self.shapes])
+
+    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
+        """The inverse of `vector`."""
+        pieces = vector.split([shape.numel() for shape in self.shapes.values()])
+        named = zip(self.shapes.items(), pieces, strict=True)
+        return {name: piece.reshape(shape) for (name, shape), piece in named}
+
+
 def _least_squares(
     model: type[Lens],
     start: dict[str, Tensor],
@@ -118,23 +145,15 @@ def _least_squares(
     theta: Tensor,
     direction: Tensor,
     goal: Tensor,
+    rounds: int,
 ) -> tuple[Lens, float]:
     """The closest lens within bounds by the Levenberg–Marquardt method, and its mean squared
     distance, which is infinite if no lens was found."""
-    names = list(start)
-    shapes = [start[name].shape for name in names]
-    sizes = [shape.numel() for shape in shapes]
-    declared = [model.declared[name] for name in names]
-    bounds = [p.bounds or (p.low, p.high) for p in declared]
-    low, high = (
-        torch.cat([theta.new_full((s,), b[end]) for b, s in zip(bounds, sizes, strict=True)])
-        for end in (0, 1)
-    )
+    packing = Packing(model, start)
+    low, high = packing.low, packing.high
 
     def lens_of(vector: Tensor) -> Lens:
-        pieces = zip(names, vector.split(sizes), shapes, strict=True)
-        tensors = {name: piece.reshape(shape) for name, piece, shape in pieces}
-        return model._from_tensors(tensors | {"theta_max": theta_max})
+        return model._from_tensors(packing.tensors(vector) | {"theta_max": theta_max})
 
     def miss(vector: Tensor) -> Tensor:
         return (lens_of(vector)._flat(theta, direction) - goal).flatten()
@@ -145,12 +164,12 @@ def _least_squares(
         value = (lens._flat(theta, direction) - goal).square().mean().item()
         return value if rises and value >= 0 else math.inf
 
-    vector = torch.cat([start[name].flatten() for name in names]).clamp(low, high)
+    vector = packing.vector(start).clamp(low, high)
     cost, damping = cost_of(vector), 1e-3
     if not math.isfinite(cost):
         return lens_of(vector), math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
-    for _ in range(200):
+    for _ in range(rounds):
         columns = [torch.func.jvp(miss, (vector,), (axis,)) for axis in axes]
         error, slopes = columns[0][0], torch.stack([column[1] for column in columns], 1)
         scale = slopes.norm(dim=0).clamp(min=1e-30)
