@@ -19,7 +19,7 @@ FLOORS = (
     ("viz",),
     ("layers",),
     ("views",),
-    ("data",),
+    ("calibrate", "data"),
     ("boxes", "lens"),
     ("ops", "utils"),
 )

@@ -16,7 +16,7 @@ from torch import Tensor
 from darswin.lens.solve import length_of
 
 POWERS = (0, 2, 3, 4)  # of ρ in the depth g(ρ); a linear term would be a kink at the axis
-PRIOR = 0.07  # how far the principal point is expected from the middle, in parts of the side
+PRIOR = 0.04  # how far the principal point is expected from the middle, in parts of the side
 FLOOR = 0.05  # px: smaller residuals say nothing
 
 
@@ -60,7 +60,7 @@ def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) 
     while step.max() > 0.2:
         around = center + step * torch.cartesian_prod(line, line)
         error = misses(around)[1].square() + FLOOR**2
-        prior = ((around - middle) / (PRIOR * sides)).square().sum(1) / 2
+        prior = ((around - middle) / (PRIOR * sides)).square().sum(1)
         center = around[((counts * error.log()).sum(1) + prior).argmin()]
         step, line = step / 3, torch.arange(-3, 4, dtype=corners.dtype)
     plane, error = (x[0] for x in misses(center[None]))

@@ -1,11 +1,10 @@
 """The refinement of a calibration: the lens and all poses together, by robust least squares.
 
-Levenberg–Marquardt steps in float64 on the distances of corners in pixels. Each pose touches its
-own picture only, so poses are eliminated first (the Schur complement).
+Levenberg–Marquardt steps in float64 on the distances of corners in pixels. A pose touches its own
+picture only, so the poses are eliminated first (the Schur complement).
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,11 +16,12 @@ from darswin.lens.fitting import Packing
 ROUNDS = 100
 LOST = 1e4  # px: the distance of a corner whose ray the lens does not see
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
-RAYLEIGH = math.sqrt(2 * math.log(2))  # the median of a corner's distance, in standard deviations
 FINEST = 1e-4  # px: the least scale
-# The places of numbers that stay as they are.
-HELD = {(OCam, "coefficients"): (1,), (OCamInverse, "coefficients"): (0,),
-        (Tabulated, "radii"): (0,)}  # fmt: skip
+# The distance that 50 % and 90 % of the corners do not exceed, in standard deviations.
+MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.9))
+# The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
+HELD = {(OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0], (Tabulated, "radii"): [0],
+        (Tabulated, "angles"): slice(None)}  # fmt: skip
 
 
 class Free:
@@ -34,56 +34,83 @@ class Free:
     def __init__(self, lens: Lens, square_pixels: bool):
         tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
         tensors["center"] = lens.center
+        held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
+        for (model, name), places in HELD.items():
+            if isinstance(lens, model):
+                held[name][places] = True
         if not square_pixels:
             tensors["affine"] = lens._affine()
+            held["affine"] = torch.tensor([[True, True], [True, False]])
+        free = ~torch.cat([value.flatten() for value in held.values()])
+        names = [
+            name + (f"[{k}]" if value.dim() > 1 else "")
+            for name, value in tensors.items()
+            for k in range(value[0].numel())
+        ]
+        self.names = [name for name, is_free in zip(names, free, strict=True) if is_free]
         self.model, self.image_size = type(lens), lens.image_size
         self.packing = Packing(self.model, tensors)
-        self.names, free = [], []
-        for name, tensor in tensors.items():
-            count = tensor[0].numel()
-            self.names += [f"{name}[{k}]" if tensor.dim() > 1 else name for k in range(count)]
-            held = HELD.get((self.model, name), ())
-            if name in ("angles", "affine"):  # of an affine, the ratio of the sides is free
-                held = range(count - (name == "affine"))
-            free += [k not in held for k in range(count)]
-        self.free = torch.tensor(free)
-        self.names = [name for name, is_free in zip(self.names, free, strict=True) if is_free]
-        start = self.packing.vector(tensors)
-        self.start = start[self.free]
-        self.low, self.high = self.packing.low[self.free], self.packing.high[self.free]
-        self._rest = torch.where(self.free, 0, start)
-        self._places = torch.eye(len(free), dtype=start.dtype)[:, self.free]
+        self.low, self.high = self.packing.low[free], self.packing.high[free]
+        vector = self.packing.vector(tensors)
+        self.start, self._rest = vector[free], torch.where(free, 0, vector)
+        self._places = torch.eye(len(vector)).to(vector)[:, free]
 
-    def tensors(self, vector: Tensor) -> dict[str, Tensor | None]:
+    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
+        """The parameters of the lens."""
         found = self.packing.tensors(self._rest + self._places @ vector)
         if self.model is OCamInverse:  # r(0) = 0
             slopes = found["coefficients"][:, 1:]
-            powers = (-math.pi / 2) ** torch.arange(1, slopes.shape[1] + 1, dtype=vector.dtype)
+            powers = (-math.pi / 2) ** torch.arange(1, slopes.shape[1] + 1).to(vector)
             found["coefficients"] = torch.cat((-(slopes * powers).sum(1, keepdim=True), slopes), 1)
         return found | {"image_size": self.image_size}
 
     def lens(self, vector: Tensor) -> Lens | None:
         """The lens up to its limit; None if there is none."""
-        if not bool(vector.isfinite().all()):
-            return None
         try:
             return self.model(**self.tensors(vector))
         except ValueError:
             return None
 
+    def at(self, vector: Tensor, theta_max: Tensor) -> Lens:
+        """The lens without checks; differentiable."""
+        return self.model._from_tensors(self.tensors(vector) | {"theta_max": theta_max})
+
     def held(self, vector: Tensor, side: Tensor) -> Tensor:
-        """(n,) bool: the numbers that are at a bound and would leave it, along `side`."""
+        """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""
         return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
 
-    def pixels(self, vector: Tensor, points: Tensor, theta_max: Tensor) -> Tensor:
-        """Where the lens of a vector sees points (..., 3); differentiable."""
-        return self.model._from_tensors(
-            self.tensors(vector) | {"theta_max": theta_max}
-        ).project_points(points)
+
+class State(NamedTuple):
+    """The free numbers, their lens, and the poses of the boards."""
+
+    vector: Tensor
+    lens: Lens
+    rotations: Tensor
+    translations: Tensor
+
+    def of(self, pictures: Tensor) -> "State":
+        """The poses of some pictures, (P,) bool."""
+        rotations, translations = self.rotations[pictures], self.translations[pictures]
+        return State(self.vector, self.lens, rotations, translations)
+
+    def with_poses(self, pictures: Tensor, other: "State") -> "State":
+        """The poses of some pictures, (P,) bool, from another state."""
+        rotations = torch.where(pictures[:, None, None], other.rotations, self.rotations)
+        translations = torch.where(pictures[:, None], other.translations, self.translations)
+        return State(self.vector, self.lens, rotations, translations)
+
+    def moved(self, free: Free, steps: Tensor, lens_moves: bool) -> "State | None":
+        """The state after steps (P, n + 6); None if it has no lens."""
+        count, lens = len(self.vector), self.lens
+        vector = (self.vector + steps[0, :count]).clamp(free.low, free.high)
+        if lens_moves and (lens := free.lens(vector)) is None:
+            return None
+        axes = torch.broadcast_tensors(steps[:, None, count:-3], torch.eye(3).to(steps))
+        turns = torch.matrix_exp(torch.linalg.cross(*axes).mT)
+        return State(vector, lens, turns @ self.rotations, self.translations + steps[:, -3:])
 
 
-@dataclass
-class Views:
+class Views(NamedTuple):
     """What is calibrated from: corners (P, K, 2) px, 0 where not `seen`, (P, K), and the board's
     points (K, 3), whose z is 0."""
 
@@ -91,88 +118,93 @@ class Views:
     seen: Tensor
     board: Tensor
 
-    def miss(self, lens: Lens | None, rotations: Tensor, translations: Tensor) -> Tensor:
+    def points(self, state: State) -> Tensor:
+        """(P, K, 3): the board's points in the camera's frame."""
+        return self.board @ state.rotations.mT + state.translations[:, None]
+
+    def miss(self, state: State) -> Tensor:
         """(P, K, 2) px: by how much the lens misses the corners; 0 where not seen."""
-        if lens is None:
-            return torch.full_like(self.corners, math.inf)
-        points = self.board @ rotations.mT + translations[:, None]
-        off = lens.project_points(points) - self.corners
-        lost = off.isnan().any(-1, keepdim=True)
-        off = torch.where(lost, LOST, off)
+        off = state.lens.project_points(self.points(state)) - self.corners
+        off = torch.where(off.isnan().any(-1, keepdim=True), LOST, off)
         return torch.where(self.seen[..., None], off, 0.0)
 
+    def slopes(self, free: Free, state: State) -> Tensor:
+        """(P, K, 2, n + 6): the derivatives of the pixels by the free numbers, by the rotation
+        vector of each pose in the camera's frame, and by its translation; 0 where not seen."""
+        points, count = self.points(state), len(state.vector)
 
-class Equations(NamedTuple):
-    """The normal equations of one step, for each picture: of the lens (P, n, n), of the pose
-    (P, 6, 6), and between them (P, n, 6); the right sides (P, n) and (P, 6); and the derivatives of
-    the pixels, (P, K, 2, n + 6)."""
+        def along(way: Tensor) -> Tensor:
+            tangents = way[:count], way[count:].expand_as(points)
+            return torch.func.jvp(
+                lambda vector, points: free.at(vector, state.lens.theta_max).project_points(points),
+                (state.vector, points),
+                tangents,
+            )[1]
 
-    lens: Tensor
-    poses: Tensor
-    mixed: Tensor
-    lens_side: Tensor
-    pose_side: Tensor
-    slopes: Tensor
+        ways = torch.eye(count + 3).to(points)
+        slopes = torch.func.vmap(along, out_dims=-1)(ways)
+        there = self.seen & slopes.isfinite().flatten(2).all(-1)
+        slopes = torch.where(there[..., None, None], slopes, 0.0)
+        by_point = slopes[..., count:]
+        # A turn ω moves a point by ω × turned.
+        turned = (self.board @ state.rotations.mT)[:, :, None].expand_as(by_point)
+        by_turn = torch.linalg.cross(turned, by_point)
+        return torch.cat((slopes[..., :count], by_turn, by_point), -1)
 
-    def reduced(self, damping: float, held: Tensor) -> "Reduced":
-        """The equations of the lens alone; numbers of the lens that are `held` do not move."""
-        total = self.lens.sum(0).diagonal().clamp(min=1e-30)
-        scale = ~held / total.sqrt()
-        size = 1 / self.poses.diagonal(dim1=1, dim2=2).clamp(min=1e-30).sqrt()
-        poses = size[:, :, None] * self.poses * size[:, None]
-        mixed = scale[:, None] * self.mixed * size[:, None]
+
+class Normal:
+    """The normal equations of a step after the poses are eliminated, for slopes (P, K, 2, n + 6),
+    misses (P, K, 2) and weights (P, K); numbers of the lens that are held do not move."""
+
+    def __init__(
+        self, slopes: Tensor, miss: Tensor, weights: Tensor, free: Free, vector: Tensor,
+        lens_moves: bool = True,
+    ):  # fmt: skip
+        flat = (slopes * weights[..., None, None]).flatten(1, 2)
+        self.matrix = flat.mT @ slopes.flatten(1, 2)
+        self.side = -(flat.mT @ miss.flatten(1, 2)[..., None])[..., 0]
+        self.count = len(vector)
+        squares = self.matrix.diagonal(dim1=1, dim2=2)
+        self.scale = torch.where(
+            torch.arange(squares.shape[1]) < self.count, squares.sum(0), squares
+        ).clamp(min=1e-30).rsqrt()  # fmt: skip
+        held = free.held(vector, self.side[:, : self.count].sum(0)) | (not lens_moves)
+        self.scale[:, : self.count] *= ~held
+
+    def damped(self, damping: float) -> "Normal":
+        """The same after elimination, in units in which the diagonals are 1."""
+        n = self.count
+        matrix = self.scale[:, :, None] * self.matrix * self.scale[:, None]
+        side = self.scale * self.side
         # A picture without corners has no equations.
-        poses = poses + (damping + 1e-14) * torch.eye(6).to(scale)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(poses)[0])
-        back = mixed @ inverse
-        matrices = scale[:, None] * self.lens * scale - back @ mixed.mT
-        sides = self.pose_side * size
-        lens_sides = scale * self.lens_side - (back @ sides[..., None])[..., 0]
-        return Reduced(scale, size, inverse, back, matrices, sides, lens_sides)
+        poses = matrix[:, n:, n:] + (damping + 1e-14) * torch.eye(6).to(matrix)
+        self.inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(poses)[0])
+        self.own = (self.inverse @ side[:, n:, None])[..., 0]
+        self.follow = -self.inverse @ matrix[:, n:, :n]
+        self.lens = matrix[:, :n, :n] + matrix[:, :n, n:] @ self.follow
+        self.lens_side = side[:, :n] + (self.follow.mT @ side[:, n:, None])[..., 0]
+        self.damping = damping * torch.eye(n).to(matrix)
+        return self
 
+    def steps(self, left_out: bool = False) -> Tensor:
+        """(P, n + 6): the step of the lens, and that of each pose; `left_out`: of a lens without
+        the equations of the pose's picture."""
+        matrix, side = self.lens.sum(0) + self.damping, self.lens_side.sum(0)
+        if left_out:
+            matrix, side = matrix - self.lens, side - self.lens_side
+        lens = (_inverse(matrix) @ side[..., None])[..., 0].expand_as(self.lens_side)
+        poses = self.own + (self.follow @ lens[..., None])[..., 0]
+        return self.scale * torch.cat((lens, poses), 1)
 
-class Reduced(NamedTuple):
-    """Each picture's equations of the lens after its pose is eliminated, in units in which the
-    diagonals are 1: factors of the lens (n,) and of poses (P, 6), the inverses (P, 6, 6) of the
-    poses' matrices, and the products (P, n, 6) with them; matrices (P, n, n); right sides."""
-
-    scale: Tensor
-    size: Tensor
-    inverse: Tensor
-    back: Tensor
-    matrices: Tensor
-    pose_sides: Tensor
-    sides: Tensor
-
-    def step(self, damping: float) -> tuple[Tensor, Tensor]:
-        """The steps of the lens (n,) and of the poses (P, 6)."""
-        eye = torch.eye(len(self.scale)).to(self.scale)
-        step = _inverse(self.matrices.sum(0) + damping * eye) @ self.sides.sum(0)
-        return self.scale * step, self.poses(step)
-
-    def poses(self, steps: Tensor) -> Tensor:
-        """(P, 6): the steps of the poses that follow from that of the lens, (n,) or (P, n)."""
-        own = (self.inverse @ self.pose_sides[..., None])[..., 0]
-        steps = steps.expand(len(own), -1)
-        return self.size * (own - (self.back.mT @ steps[..., None])[..., 0])
-
-    def without(self) -> tuple[Tensor, Tensor]:
-        """The steps of the lens, (P, n), and of each pose, (P, 6), if its picture is left out of
-        the lens."""
-        rest = _inverse(self.matrices.sum(0) - self.matrices)
-        steps = (rest @ (self.sides.sum(0) - self.sides)[..., None])[..., 0]
-        return self.scale * steps, self.poses(steps)
-
-    def covariance(self, used: Tensor) -> Tensor:
-        """(n + 3, n + 3) of the lens and of the mean rotation of the poses that are `used`, for
-        corners with a standard deviation of 1 px."""
-        lens = _inverse(self.matrices.sum(0))
-        turned = self.size[:, :3, None] * self.back.mT[:, :3]
-        follow = -turned[used].mean(0)
-        own = self.size[:, :3, None] * self.inverse[:, :3, :3] * self.size[:, None, :3]
-        both = torch.cat((torch.diag(self.scale), follow))
-        joint = both @ lens @ both.T
-        joint[-3:, -3:] += own[used].sum(0) / used.sum() ** 2
+    def covariance(self) -> Tensor:
+        """(n + 3, n + 3): of the lens and the mean rotation of the poses, for corners with a
+        standard deviation of 1 px."""
+        size = self.scale[:, self.count : -3, None]
+        both = torch.cat(
+            (torch.diag(self.scale[0, : self.count]), (size * self.follow[:, :3]).mean(0))
+        )
+        joint = both @ _inverse(self.lens.sum(0)) @ both.T
+        joint[-3:, -3:] += (size * self.inverse[:, :3, :3] * size.mT).mean(0) / len(size)
         return joint
 
 
@@ -183,107 +215,41 @@ def _inverse(matrix: Tensor) -> Tensor:
     return (vectors / values[..., None, :]) @ vectors.mT
 
 
-def equations(
-    views: Views, free: Free, vector: Tensor, lens: Lens, rotations: Tensor,
-    translations: Tensor, weights: Tensor,
-) -> Equations:  # fmt: skip
-    """Those for weights (P, K) of the corners; the slopes of the lens by forward differentiation.
-
-    A pose moves by a rotation vector in the camera's frame and a translation."""
-    turned = views.board @ rotations.mT
-    points = turned + translations[:, None]
-    count = len(vector)
-    ways = torch.eye(count + 3, dtype=vector.dtype)
-
-    def along(way: Tensor) -> Tensor:
-        tangents = way[:count], way[count:].expand_as(points)
-        return torch.func.jvp(
-            lambda v, p: free.pixels(v, p, lens.theta_max), (vector, points), tangents
-        )[1]
-
-    slopes = torch.func.vmap(along, out_dims=-1)(ways)
-    used = views.seen & slopes.isfinite().all(-1).all(-1)
-    slopes = torch.where(used[..., None, None], slopes, 0.0)
-    by_point = slopes[..., count:]  # (P, K, 2, 3)
-    # The pixel moves by by_point @ (ω × turned + shift).
-    by_turn = torch.linalg.cross(turned[..., None, :].expand_as(by_point), by_point)
-    slopes = torch.cat((slopes[..., :count], by_turn, by_point), -1)
-    miss = views.miss(lens, rotations, translations)
-    rows = slopes * (weights * used)[..., None, None]
-    flat = slopes.flatten(1, 2)
-    normal = rows.flatten(1, 2).mT @ flat
-    side = -(rows * miss[..., None]).sum((1, 2))
-    return Equations(
-        normal[:, :count, :count], normal[:, count:, count:], normal[:, :count, count:],
-        side[:, :count], side[:, count:], slopes,
-    )  # fmt: skip
-
-
-class Refined(NamedTuple):
-    """The free numbers, their lens, the poses, the misses (P, K, 2), and the weights (P, K)."""
-
-    vector: Tensor
-    lens: Lens
-    rotations: Tensor
-    translations: Tensor
-    miss: Tensor
-    weights: Tensor
-    scale: float
-
-
-def turns(vectors: Tensor) -> Tensor:
-    """(P, 3, 3): rotations by vectors (P, 3), rad."""
-    axes = torch.broadcast_tensors(vectors[:, None], torch.eye(3).to(vectors))
-    return torch.matrix_exp(torch.linalg.cross(*axes).mT)
-
-
 def refine(
-    views: Views, free: Free, vector: Tensor, rotations: Tensor, translations: Tensor,
-    lens_moves: bool = True,
-) -> Refined | None:  # fmt: skip
-    """The smallest sum of Cauchy losses near a start; None if the start has no lens."""
-    lens = free.lens(vector)
-    if lens is None:
-        return None
-    miss = views.miss(lens, rotations, translations)
+    views: Views, free: Free, state: State, lens_moves: bool = True
+) -> tuple[State, float]:  # fmt: skip
+    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss."""
+    miss = views.miss(state)
     damping, scale, fine, still = 1e-3, math.inf, False, 0
     for _ in range(ROUNDS):
         distance = miss.norm(dim=-1)[views.seen]
-        part, typical = (0.5, RAYLEIGH) if fine else (0.9, math.sqrt(2 * math.log(10)))
-        spread = distance.quantile(part).item() / typical
-        scale = max(min(scale, SCALE * spread), FINEST)
-        cost = _cost(miss, views.seen, scale)
-        weights = weights_of(miss, views.seen, scale)
-        normal = equations(views, free, vector, lens, rotations, translations, weights)
-        held = free.held(vector, normal.lens_side.sum(0)) | (not lens_moves)
-        before = cost
+        part, typical = (0.5, MEDIAN) if fine else (0.9, MOST)
+        scale = max(min(scale, SCALE * distance.quantile(part).item() / typical), FINEST)
+        before = cost = losses(miss, scale).sum().item()
+        slopes, weights = views.slopes(free, state), weights_of(miss, scale)
+        normal = Normal(slopes, miss, weights, free, state.vector, lens_moves)
         while damping < 1e10:
-            step, moves = normal.reduced(damping, held).step(damping)
-            trial = (vector + step).clamp(free.low, free.high)
-            trial_lens = free.lens(trial) if lens_moves else lens
-            poses = turns(moves[:, :3]) @ rotations, translations + moves[:, 3:]
-            trial_miss = views.miss(trial_lens, *poses)
-            trial_cost = _cost(trial_miss, views.seen, scale)
-            if trial_lens is not None and trial_cost < cost:
-                vector, lens, miss, cost = trial, trial_lens, trial_miss, trial_cost
-                rotations, translations = poses
-                damping = max(damping / 10, 1e-12)
-                break
+            trial = state.moved(free, normal.damped(damping).steps(), lens_moves)
+            if trial is not None:
+                trial_miss = views.miss(trial)
+                cost = losses(trial_miss, scale).sum().item()
+                if cost < before:
+                    state, miss, damping = trial, trial_miss, max(damping / 10, 1e-12)
+                    break
             damping *= 10
-        still = still + 1 if cost > (1 - (1e-8 if fine else 1e-3)) * before else 0
+        still = still + 1 if cost > (1 - (1e-6 if fine else 1e-3)) * before else 0
         if damping >= 1e10 or still >= 2:
             if fine:
                 break
             fine, damping, still = True, 1e-4, 0
-    return Refined(
-        vector, lens, rotations, translations, miss, weights_of(miss, views.seen, scale), scale
-    )
+    return state, scale
 
 
-def weights_of(miss: Tensor, seen: Tensor, scale: float) -> Tensor:
-    return seen / (1 + miss.square().sum(-1) / scale**2)
+def weights_of(miss: Tensor, scale: float) -> Tensor:
+    """(P, K): the weight of each corner in the Cauchy loss."""
+    return 1 / (1 + miss.square().sum(-1) / scale**2)
 
 
-def _cost(miss: Tensor, seen: Tensor, scale: float) -> float:
-    loss = (miss.square().sum(-1) / scale**2).log1p()
-    return torch.where(seen, loss, 0.0).sum().item()
+def losses(miss: Tensor, scale: float) -> Tensor:
+    """(P, K): the Cauchy loss of each corner."""
+    return (miss.square().sum(-1) / scale**2).log1p()

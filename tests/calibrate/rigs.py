@@ -96,7 +96,7 @@ def rig(
         )  # fmt: skip
         spin = (u[4] - 0.5) * torch.stack((0 * theta, 0 * theta, 1 + 0 * theta))
         rotation = facing @ turn(lean) @ turn(spin)
-        radius = theta_max * (0.2 + 0.3 * u[5])  # half the board's size, as an angle
+        radius = theta_max * (0.25 + 0.35 * u[5])  # half the board's size, as an angle
         distance = half / math.tan(min(radius, math.radians(40)))
         translation = distance * ray - rotation[:, :2] @ middle
         pixels = lens.project_points(points @ rotation[:, :2].T + translation)
