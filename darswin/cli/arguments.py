@@ -90,13 +90,13 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
     commands(**given)
 
 
-def check_out(out: str | None, inputs: Iterable[str]) -> None:
+def check_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
     """Raises ValueError if writing `out` would replace one of the files that a command reads."""
     if out is None or not os.path.exists(out):
         return
     for name in inputs:
         if os.path.exists(name) and os.path.samefile(name, out) and os.path.isfile(out):
-            raise ValueError(f"--out {out} would replace {name}, which this command reads")
+            raise ValueError(f"--{option} {out} would replace {name}, which this command reads")
 
 
 def _summary(function: Callable) -> str:

@@ -1,16 +1,16 @@
-"""`darswin lens`: draws, describes, converts and crops a camera calibration."""
+"""`darswin lens`: makes, draws, describes, converts and crops a camera calibration."""
 
 import math
-from typing import Literal
 
 import torch
 
 import darswin.lens
 from darswin.cli.arguments import check_out
+from darswin.cli.calibrate import Format, calibrate, write_lens
 from darswin.cli.undistort import undistort
 from darswin.cli.views import Look, Up, View
 from darswin.lens.base import Lens
-from darswin.lens.files.load import Calibration, reach
+from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
@@ -18,7 +18,6 @@ from darswin.utils.parameters import check
 from darswin.views import PolarView
 from darswin.viz.report import describe
 
-Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 VIEW_SIDE = 800  # px, the longer one
 # The limits of rings, sectors, samples along each side of a patch, and samples in total.
 MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
@@ -162,7 +161,7 @@ def convert(
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
         note = f", at most {error.item():.2g} px from {calib}"
-    _write(lens, out, format, note)
+    write_lens(lens, out, format, note)
 
 
 def crop(
@@ -200,7 +199,7 @@ def crop(
         lens = lens.cropped(*box)
     if size is not None:
         lens = lens.resized(size)
-    _write(lens, out, format, note)
+    write_lens(lens, out, format, note)
 
 
 def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
@@ -214,17 +213,6 @@ def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
     check("box", box, meets, f"a part of {picture}")
     inside = min(top, left) >= 0 and top + height <= rows and left + width <= columns
     return "" if inside else f"; the box extends beyond {picture}, which means padding"
-
-
-def _write(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
-    """Writes the lens and prints what was written."""
-    written = darswin.lens.save(lens, out, format)
-    degrees = math.degrees(lens.theta_max.item())
-    if written != "darswin" and bool(
-        (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
-    ):
-        note += f"; {written} files have no θ_max: read it with --theta_max_deg {degrees:.2f}"
-    print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
 def _calibration(
@@ -255,5 +243,6 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
 
 
 COMMANDS = {
-    "show": show, "info": info, "convert": convert, "crop": crop, "undistort": undistort
+    "show": show, "info": info, "convert": convert, "crop": crop, "calibrate": calibrate,
+    "undistort": undistort,
 }  # fmt: skip

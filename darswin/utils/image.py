@@ -14,7 +14,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from darswin.utils.exif import TURNS
 from darswin.utils.files import check_is_file, replace_file
 
-__all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
+__all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented", "read_stored"]
 
 WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 
@@ -54,6 +54,19 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     image = image.swapaxes(0, 1) if swapped else image
     across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
     return np.ascontiguousarray(image[down, across]), orientation
+
+
+def read_stored(path: str | Path, channels: int = 3) -> np.ndarray:
+    """`read_image` with the pixels as the camera stores them, which a calibration describes.
+
+    Raises:
+        BrokenImageError: see `read_oriented`.
+    """
+    image, orientation = read_oriented(path, channels)
+    swapped, *reversed_ = TURNS[orientation]
+    across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
+    image = image[down, across]
+    return np.ascontiguousarray(image.swapaxes(0, 1) if swapped else image)
 
 
 def written_as(path: Path) -> Path:

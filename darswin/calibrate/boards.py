@@ -1,0 +1,315 @@
+"""Calibration boards, and their corners in pictures."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import cv2
+import numpy as np
+
+from darswin.utils.image import with_channels
+from darswin.utils.nearest import did_you_mean
+from darswin.utils.parameters import check
+
+Kind = Literal["chessboard", "charuco", "april"]
+Found = tuple[Sequence[np.ndarray], np.ndarray | None]  # corners, and their numbers
+
+SIDE = 1200  # px, to which larger pictures are reduced at first
+MOST_CHANGE = 0.45  # of a step between corners to the next, in steps; a rim of 125° has 0.33
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board with known corners; `chessboard`, `charuco` and `april_grid` make one.
+
+    Attributes:
+        columns, rows: of the grid of corners. square: the side of a square or a tag, in metres or
+            any unit of length. other: the side of a marker in a ChArUco board's squares, or the gap
+            between tags. dictionary: OpenCV's name of the markers, such as "4X4_50".
+    """
+
+    kind: Kind
+    columns: int
+    rows: int
+    square: float
+    other: float = 0.0
+    dictionary: str = ""
+
+    @classmethod
+    def chessboard(cls, columns: int, rows: int, square: float) -> Self:
+        """A chessboard with `columns` × `rows` inner corners."""
+        _check(columns, rows, 2, square=square)
+        return cls("chessboard", columns, rows, square)
+
+    @classmethod
+    def charuco(
+        cls, columns: int, rows: int, square: float, marker: float, dictionary: str = "4X4_250"
+    ) -> Self:
+        """A board of `columns` × `rows` squares, a black one at the upper left, with markers in the
+        white ones, as OpenCV draws it."""
+        _check(columns, rows, 3, square=square, marker=marker)
+        check("marker", marker, marker < square, f"below the square of {square:g}")
+        _dictionary(dictionary, columns * rows // 2)
+        return cls("charuco", columns - 1, rows - 1, square, marker, dictionary)
+
+    @classmethod
+    def april_grid(
+        cls, columns: int, rows: int, tag: float, gap: float, dictionary: str = "APRILTAG_36h11"
+    ) -> Self:
+        """A grid of `columns` × `rows` AprilTags with the side `tag` and a `gap` between them. They
+        count from the upper left, or from the lower left as Kalibr draws them."""
+        _check(columns, rows, 1, square=tag, gap=gap)
+        _dictionary(dictionary, columns * rows)
+        return cls("april", 2 * columns, 2 * rows, tag, gap, dictionary)
+
+    @property
+    def points(self) -> np.ndarray:
+        """(K, 2) float64: the corners, row by row, x along columns and y along rows."""
+        place = np.arange(max(self.columns, self.rows), dtype=np.float64)
+        pair, second = np.divmod(place, 2)
+        april = pair * (self.square + self.other) + second * self.square
+        place = april if self.kind == "april" else place * self.square
+        return np.stack(np.meshgrid(place[: self.columns], place[: self.rows]), -1).reshape(-1, 2)
+
+    @property
+    def reach(self) -> float:
+        """The distance around a corner without edges of other corners."""
+        if self.kind == "chessboard":
+            return 0.4 * self.square
+        if self.kind == "charuco":
+            return (self.square - self.other) / 2
+        return min(self.square / (_dictionary(self.dictionary).markerSize + 2), self.other / 2)
+
+
+def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
+    """The corners of a board in a picture.
+
+    Args:
+        picture: (H, W), (H, W, 1) grey or (H, W, 3) RGB, uint8.
+
+    Returns:
+        (K, 2) px, float64, in the order of `board.points`; NaN where a corner was not found. All
+        are NaN if the picture does not show the board, or shows its corners in a wrong order.
+    """
+    if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
+        raise TypeError("a picture must be an array of uint8")
+    if picture.ndim not in (2, 3) or np.atleast_3d(picture).shape[2] not in (1, 3):
+        raise ValueError(f"a picture must be (H, W), (H, W, 1) or (H, W, 3), got {picture.shape}")
+    grey = np.ascontiguousarray(with_channels(np.atleast_3d(picture), 1)[..., 0])
+    find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
+    for grid in find(grey, board):
+        grid = _refined(grey, grid, board) if np.isfinite(grid).any() else grid
+        least = 0.9 * np.isfinite(grid).sum()
+        # Markers tell each corner, so single wrong ones can be left out.
+        while (odd := wrong(grid, board)).any() and board.kind != "chessboard":
+            grid[odd == odd.max()] = np.nan
+        if np.isfinite(grid).sum() >= max(8, least) and not odd.any():
+            return grid.reshape(-1, 2)
+    return np.full(board.points.shape, np.nan)
+
+
+def wrong(grid: np.ndarray, board: Board) -> np.ndarray:
+    """(rows, columns): how often each of the corners (rows, columns, 2) px disagrees with its
+    neighbours. As a smooth lens shows a board, no square is crossed or mirrored, and steps along
+    rows and columns change little from one to the next."""
+    odd = np.zeros(grid.shape[:2], int)
+
+    def mark(bad: np.ndarray, *places: tuple[int, int]) -> None:
+        for row, column in places:
+            odd[row : row + bad.shape[0], column : column + bad.shape[1]] += bad
+
+    across, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
+    for i, a in enumerate((across[:-1], across[1:])):
+        for j, d in enumerate((down[:, :-1], down[:, 1:])):
+            mark(_cross(a, d) <= 0, (i, 0), (i, 1), (1 - i, j))
+    for axis in (0, 1):
+        units = np.linalg.norm(np.diff(_shaped(board.points, board), axis=axis), axis=-1)
+        steps = np.diff(grid, axis=axis) / units[..., None]
+        ahead, behind = ((slice(k, k - 1 or None),) for k in (0, 1))
+        px, where = np.linalg.norm(steps, axis=-1), (slice(None),) * axis
+        least = np.minimum(px[where + ahead], px[where + behind])
+        change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
+        mark(change > MOST_CHANGE * least, *((k * (1 - axis), k * axis) for k in range(3)))
+    return odd
+
+
+def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
+    """(rows, columns): the smallest length, px, of the board's unit of length from each corner to
+    its neighbours; NaN without neighbours."""
+    sides = (slice(0, -2), slice(1, -1)), (slice(2, None), slice(1, -1))
+    px, units = (
+        [
+            np.linalg.norm(
+                np.pad(a, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)[s] - a, axis=-1
+            )
+            for s in (*sides, *(side[::-1] for side in sides))
+        ]
+        for a in (grid, _shaped(board.points, board))
+    )
+    return np.fmin.reduce([p / u for p, u in zip(px, units, strict=True)])
+
+
+def edge_width(picture: np.ndarray, corners: np.ndarray, board: Board) -> float:
+    """px, of the edges at the corners of a board: 2 where they are sharp, and 2.5 σ where they are
+    blurred by a Gaussian."""
+    grey = with_channels(np.atleast_3d(picture), 1)[..., 0].astype(np.float64)
+    reach = pixels_per_unit(_shaped(corners, board), board).ravel() * board.reach
+    widths = []
+    for (x, y), half in zip(corners, np.clip(reach, 2, 15), strict=True):
+        if np.isfinite((x, half)).all():
+            rows, columns = (slice(max(0, int(at - half)), int(at + half) + 2) for at in (y, x))
+            patch = grey[rows, columns]
+            widths.append(np.ptp(patch) / max(np.hypot(*np.gradient(patch)).max(), 1e-9))
+    return float(np.median(widths))
+
+
+def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] | None:
+    """The middle (x, y) and the radius, px, of the circle that a fisheye fills on its sensor.
+
+    None if there is none: the pictures have bright corners, or their bright part is not round.
+    """
+    brightest = np.maximum.reduce([with_channels(np.atleast_3d(p), 1)[..., 0] for p in pictures])
+    light = cv2.GaussianBlur(brightest, (0, 0), 1.0).astype(np.float64)
+    height, width = light.shape
+    part = max(2, min(height, width) // 40)
+    ends = [light[:part], light[-part:]]
+    dark = max(
+        np.median(end[:, side]) for end in ends for side in (slice(part), slice(-part, None))
+    )
+    middle = np.median(light[height // 4 : -height // 4, width // 4 : -width // 4])
+    if dark > 0.25 * middle:
+        return None
+    there = light > dark + max(4.0, 0.15 * (middle - dark))
+    rows, columns = there.any(1).nonzero()[0], there.any(0).nonzero()[0]
+    x = [there.argmax(1)[rows], width - 1 - there[:, ::-1].argmax(1)[rows], columns, columns]
+    y = [rows, rows, there.argmax(0)[columns], height - 1 - there[::-1].argmax(0)[columns]]
+    rim = np.stack((np.concatenate(x), np.concatenate(y)), 1).astype(np.float64)
+    rim = rim[((rim > 1) & (rim < (width - 2, height - 2))).all(1)]
+    kept, near = rim, 0.0
+    for _ in range(20):
+        if len(kept) < 16:
+            return None
+        terms = np.column_stack((2 * kept, np.ones(len(kept))))
+        a, b, c = np.linalg.lstsq(terms, (kept**2).sum(1), rcond=None)[0]
+        radius = math.sqrt(max(c + a * a + b * b, 0.0))
+        off = np.abs(np.hypot(*(rim - (a, b)).T) - radius)
+        near = max(1.5, 0.01 * radius, float(np.median(off)))
+        kept = rim[off < near]
+    round_ = near <= max(1.5, 0.01 * radius) and len(kept) > 0.6 * len(rim)
+    return (float(a), float(b), radius) if round_ else None
+
+
+def _scales(grey: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """The picture as detectors should try it, and its scale."""
+    for scale, contrast in ((1, False), (1, True), (2, False), (2, True), (0.5, True)):
+        scale *= min(1.0, SIDE / max(grey.shape))
+        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        tried = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=way)
+        yield cv2.createCLAHE(4.0, (8, 8)).apply(tried) if contrast else tried, scale
+
+
+def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
+    """Grids of corners that might be the board."""
+    older = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for detect, flags in (
+        (cv2.findChessboardCornersSB, cv2.CALIB_CB_EXHAUSTIVE),
+        (cv2.findChessboardCorners, older),
+    ):
+        for tried, scale in _scales(grey):
+            there, corners = detect(tried, (board.columns, board.rows), flags=flags)
+            if there:
+                grid = _shaped(corners.astype(np.float64), board)
+                turn = _cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
+                # A chessboard looks the same from its other end, but is never mirrored.
+                yield ((grid if turn.mean() > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
+
+
+def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
+    size = board.columns + 1, board.rows + 1
+    drawn = cv2.aruco.CharucoBoard(size, board.square, board.other, _dictionary(board.dictionary))
+    detector = cv2.aruco.CharucoDetector(drawn, detectorParams=_parameters())
+    yield _shaped(_collected(grey, detector.detectBoard, len(board.points), 1), board)
+
+
+def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
+    """The grids for tags with a border of one bit, or two as Kalibr's, which count from the upper
+    or the lower left, and whose first corner is any of the four."""
+    rows, columns = board.rows // 2, board.columns // 2
+    markers, found = _dictionary(board.dictionary), []
+    for border in (1, 2):
+        detector = cv2.aruco.ArucoDetector(markers, _parameters(border))
+        found.append(_collected(grey, detector.detectMarkers, rows * columns, 4))
+        if np.isfinite(found[0]).mean() > 0.2:
+            break
+    tags = max(found, key=lambda corners: np.isfinite(corners).sum())
+    for turn in range(4):
+        # A tag's corners run clockwise: upper left, upper right, lower right, lower left.
+        cells = np.roll(tags, turn, 1)[:, [0, 1, 3, 2]].reshape(rows, columns, 2, 2, 2)
+        for way in (cells, cells[::-1]):
+            yield _shaped(way.swapaxes(1, 2), board)
+
+
+def _parameters(border: int = 1) -> cv2.aruco.DetectorParameters:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate, parameters.markerBorderBits = 0.01, border
+    return parameters
+
+
+def _collected(grey: np.ndarray, detect: Callable[..., tuple], count: int, each: int) -> np.ndarray:
+    """(count, each, 2) px: what a detector of markers finds at all scales, else NaN."""
+    found = np.full((count, each, 2), np.nan)
+    for tried, scale in _scales(grey):
+        corners, numbers, *_ = detect(tried)
+        seen = () if numbers is None else zip(numbers.ravel(), corners, strict=True)
+        for number, corner in seen:
+            if number < count and np.isnan(found[number]).any():
+                found[number] = (corner.reshape(each, 2) + 0.5) / scale - 0.5
+        if not np.isnan(found).any():
+            break
+    return found
+
+
+def _refined(grey: np.ndarray, grid: np.ndarray, board: Board) -> np.ndarray:
+    """The grid with each corner where the gradients around it meet, in a window without edges of
+    other corners."""
+    px = pixels_per_unit(grid, board)
+    scale = 2 if np.nanmin(px) * board.reach < 6 else 1
+    large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    windows = np.nan_to_num(np.clip(px * board.reach * scale, 2, 12)).astype(int)
+    best, end = grid.copy(), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+    for window in np.unique(windows[windows > 0]).tolist():
+        chosen = windows == window
+        places = ((grid[chosen] + 0.5) * scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
+        cv2.cornerSubPix(large, places, (window, window), (-1, -1), end)
+        best[chosen] = (places[:, 0] + 0.5) / scale - 0.5
+    far = np.linalg.norm(best - grid, axis=-1) > 0.3 * px * board.square
+    return np.where(far[..., None], grid, best)
+
+
+def _shaped(corners: np.ndarray, board: Board) -> np.ndarray:
+    return corners.reshape(board.rows, board.columns, 2)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _dictionary(name: str, least: int = 0) -> cv2.aruco.Dictionary:
+    """OpenCV's set of markers; ValueError for an unknown one, or fewer than `least` markers."""
+    names = [known.removeprefix("DICT_") for known in dir(cv2.aruco) if known.startswith("DICT_")]
+    if name not in names:
+        raise ValueError(f"there is no dictionary {name!r}{did_you_mean(name, names)}")
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    many = len(markers.bytesList)
+    check("dictionary", name, many >= least, f"one of {least} markers or more, not of {many}")
+    return markers
+
+
+def _check(columns: int, rows: int, least: int, **sides: float) -> None:
+    for name, value in (("columns", columns), ("rows", rows)):
+        if type(value) is not int:
+            raise TypeError(f"`{name}` must be a whole number, got {type(value).__name__}")
+        check(name, value, least <= value <= 100, f"from {least} to 100")
+    for name, side in sides.items():
+        check(name, side, 0 < side < math.inf, "positive")
