@@ -41,8 +41,10 @@ CANDIDATES = (
     "Perspective", "Equidistant", "Equisolid", "Stereographic", "FieldOfView", "EnhancedUnified",
     "KannalaBrandt", "OCam", "BrownConrady", "Mei", "Fisheye624",
 )  # fmt: skip
-ASIDE = {BrownConrady: {"tangential": 2}, Mei: {"tangential": 2},
-         Fisheye624: {"tangential": 2, "prism": 4}}  # fmt: skip
+ASIDE: dict[type[Lens], dict[str, int]] = {
+    BrownConrady: {"tangential": 2}, Mei: {"tangential": 2},
+    Fisheye624: {"tangential": 2, "prism": 4},
+}  # fmt: skip
 TABLE = 12  # the steps of a table
 LEAST_CORNERS, LEAST_PICTURES = 8, 3
 OFF = 6.0  # standard deviations: a corner this far off does not fit
@@ -50,9 +52,10 @@ SHARPEST = 0.05  # px: no detector finds corners better than this
 # For doubts.
 UNSURE, UNKNOWN = 0.01, 0.2  # the radius's standard deviation, as a part of it
 FEW, BLURRED, PARALLEL = 8, 1.0, 12.0  # pictures; px; degrees
+WRONG = 0.02  # of the picture's side: a corner's standard deviation
 ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
 COVERED = 0.8  # of theta_max
-SHOWN = 5  # corners of a picture
+SHOWN = 10  # corners
 
 
 class CalibrationError(ValueError):
@@ -293,8 +296,10 @@ def _find(
     rays, used, board = start.rays(views.corners), start.fits, views.board[:, :2]
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
-    lens = _start_lens(model, terms, start, top, size)
-    free = Free(lens, square_pixels)
+    free = Free(_start_lens(model, terms, start, top, size), square_pixels)
+    lens = free.lens(free.start)
+    if lens is None:
+        raise CalibrationError(f"No {model.__name__} lens is close to the start.")
     state = State(free.start, lens, *radial.poses(rays, views.seen.to(rays), board))
     for _ in range(4):
         counts = views.seen & used[:, None]
@@ -326,7 +331,7 @@ def _start_lens(
 ) -> Lens:
     """The lens of a model that is close to the start up to the angle `top`, rad."""
     end = model._end if issubclass(model, FocalLens) else math.pi
-    if top > end + 0.1:
+    if top > end + 0.05:
         raise CalibrationError(
             f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
             f"lens ends at {math.degrees(end):.0f}°: choose another model."
@@ -351,6 +356,11 @@ def _start_lens(
 def _doubts(found: Calibration, views: Views, best: _Found, place: Tensor) -> list[str]:
     """What looks wrong; CalibrationError if the pictures do not determine the lens."""
     said, used = [], best.used
+    if found.sigma > WRONG * best.state.lens.image_size.mean():
+        raise CalibrationError(
+            f"Half of the corners are {MEDIAN * found.sigma:.3g} px or more off the best lens: are "
+            "the board and the order of its corners right?"
+        )
     theta = torch.linspace(0.3, 1, 8, dtype=torch.float64) * found.supported
     spread = (found.uncertainty_of_theta(theta) / found.lens.project(theta)).max().item()
     spread *= max(1.0, SHARPEST / max(found.sigma, 1e-12))
@@ -363,22 +373,20 @@ def _doubts(found: Calibration, views: Views, best: _Found, place: Tensor) -> li
             raise CalibrationError(f"The pictures do not determine the lens: {why}.")
         said.append(f"the radius is unsure by {100 * spread:.2g} %: {why}")
     distance = found.residuals.norm(dim=-1)
-    for k, name in enumerate(found.names):
-        off = distance[k] > OFF * max(found.sigma, SHARPEST)
-        corners = [(distance[k, i].item(), i + 1) for i in off.nonzero()[:, 0].tolist()]
-        if found.used[k]:
-            corners.sort(reverse=True)
-            said += [f"corner {i} of {name} is {d:.3g} px off" for d, i in corners[:SHOWN]]
-            if len(corners) > SHOWN:
-                said.append(f"{len(corners) - SHOWN} more corners of {name} are off")
-        elif found.rotations[k].isnan().any():
-            said.append(
-                f"{name} shows {int(views.seen[k].sum())} corners; {LEAST_CORNERS} are needed, "
-                "not on one line"
-            )
-        else:
-            typical = distance[k].nanmedian()
-            said.append(f"{name} does not fit: half of its corners are {typical:.3g} px off")
+    off = (distance > OFF * max(found.sigma, SHARPEST)) & found.used[:, None]
+    worst = sorted(((distance[k, i].item(), k, i) for k, i in off.nonzero().tolist()), reverse=True)
+    for d, k, i in worst[:SHOWN]:
+        said.append(f"corner {i + 1} of {found.names[k]} is {d:.3g} px off")
+    if len(worst) > SHOWN:
+        said.append(
+            f"{len(worst) - SHOWN} more corners are off, in {int(off.any(1).sum())} pictures"
+        )
+    for k in (~found.used).nonzero()[:, 0].tolist():
+        what = f"does not fit: half of its corners are {distance[k].nanmedian():.3g} px off"
+        if found.rotations[k].isnan().any():
+            count = int(views.seen[k].sum())
+            what = f"shows {count} corners; {LEAST_CORNERS}, not on one line, are needed"
+        said.append(f"{found.names[k]} {what}")
     if used.sum() < FEW:
         said.append(f"{int(used.sum())} pictures are few: take 10 to 20")
     if found.sigma > BLURRED:

@@ -65,8 +65,9 @@ def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) 
         step, line = step / 3, torch.arange(-3, 4, dtype=corners.dtype)
     plane, error = (x[0] for x in misses(center[None]))
     found = Start(center, center, error)
-    counts = seen & found.fits[:, None]
-    return found._replace(depth=_depth(length_of(corners - center), counts, plane, board))
+    fits = found.fits
+    radius = length_of(corners - center)
+    return found._replace(depth=_depth(radius[fits], seen[fits], plane[fits], board))
 
 
 def _in_plane(flat: Tensor, seen: Tensor, board: Tensor) -> tuple[Tensor, Tensor]:

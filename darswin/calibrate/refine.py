@@ -5,7 +5,7 @@ picture only, so the poses are eliminated first (the Schur complement).
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,8 +20,10 @@ FINEST = 1e-4  # px: the least scale
 # The distance that 50 % and 90 % of the corners do not exceed, in standard deviations.
 MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.9))
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
-HELD = {(OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0], (Tabulated, "radii"): [0],
-        (Tabulated, "angles"): slice(None)}  # fmt: skip
+HELD: dict[tuple[type[Lens], str], Any] = {
+    (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
+    (Tabulated, "radii"): [0], (Tabulated, "angles"): ...,
+}  # fmt: skip
 
 
 class Free:
@@ -101,9 +103,10 @@ class State(NamedTuple):
 
     def moved(self, free: Free, steps: Tensor, lens_moves: bool) -> "State | None":
         """The state after steps (P, n + 6); None if it has no lens."""
-        count, lens = len(self.vector), self.lens
+        count = len(self.vector)
         vector = (self.vector + steps[0, :count]).clamp(free.low, free.high)
-        if lens_moves and (lens := free.lens(vector)) is None:
+        lens = free.lens(vector) if lens_moves else self.lens
+        if lens is None:
             return None
         axes = torch.broadcast_tensors(steps[:, None, count:-3], torch.eye(3).to(steps))
         turns = torch.matrix_exp(torch.linalg.cross(*axes).mT)
@@ -237,7 +240,7 @@ def refine(
                     state, miss, damping = trial, trial_miss, max(damping / 10, 1e-12)
                     break
             damping *= 10
-        still = still + 1 if cost > (1 - (1e-6 if fine else 1e-3)) * before else 0
+        still = still + 1 if cost > (1 - (1e-5 if fine else 1e-3)) * before else 0
         if damping >= 1e10 or still >= 2:
             if fine:
                 break

@@ -13,6 +13,11 @@ from darswin.lens.solve import vector_of
 f64 = torch.float64
 # The widest field of view, degrees, that a model shows well.
 WIDEST = {"Perspective": 120, "BrownConrady": 120, "Orthographic": 170}
+OFF_CURVE = {
+    "BrownConrady": {"tangential": 2},
+    "Mei": {"tangential": 2},
+    "Fisheye624": {"tangential": 2, "prism": 4},
+}
 
 
 class Rig(NamedTuple):
@@ -45,6 +50,11 @@ def true_lens(
         min(size) / 2,
     )  # fmt: skip
     lens = fit(MODELS[model], base).lens
+    if model == "OCamInverse":  # of a fit, r(0) is not 0
+        lens.coefficients[:, 0] -= lens.project(0.0)
+    for name, count in OFF_CURVE.get(model, {}).items():
+        off = 2e-3 * (2 * torch.rand(1, count, generator=generator, dtype=f64) - 1)
+        lens = lens.replace(**{name: off})
     center = torch.tensor(
         [
             [

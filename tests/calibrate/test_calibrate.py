@@ -1,0 +1,275 @@
+"""Calibration against rigs whose lens and poses are known."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from rigs import WIDEST, board, f64, ray_errors, rig, true_lens, turn
+
+from darswin.calibrate import CalibrationError, calibrate
+from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
+from darswin.lens.solve import vector_of
+
+FOVS = (60, 120, 180, 220, 250)
+EASY = [(model, fov) for model in sorted(MODELS) for fov in (60, min(WIDEST.get(model, 250), 250))]
+ALL = [(model, fov) for model in sorted(MODELS) for fov in FOVS if fov <= WIDEST.get(model, 250)]
+
+
+def of(found, model="KannalaBrandt", **options):
+    return calibrate(found.corners, found.board, found.size, model, **options)
+
+
+def middle_of(found):
+    """A rig of an easy camera."""
+    return rig(true_lens("KannalaBrandt", 190, seed=found), 12, seed=found)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return rig(true_lens("KannalaBrandt", 190), 12)
+
+
+@pytest.mark.parametrize(("model", "fov"), EASY)
+def test_twenty_pictures_give_every_model(model, fov):
+    lens = true_lens(model, fov)
+    found = of(rig(lens, 20), model)
+    assert type(found.lens) is MODELS[model] and found.lens.theta_max.dtype == f64
+    # The poses absorb a common rotation, which narrow pictures do not tell from the center.
+    assert ray_errors(found.lens, lens, best=True).median() < 0.035
+    assert 0.17 < found.sigma < 0.23 and found.used.all()
+    assert not [doubt for doubt in found.doubts if "axis" not in doubt]
+    assert 0.95 * lens.theta_max < found.supported <= lens.theta_max * 1.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("model", "fov"), ALL)
+def test_eight_pictures_give_every_model(model, fov, seed):
+    lens = true_lens(model, fov, seed=seed)
+    points = board(7, 5) if seed == 1 else None
+    found = of(rig(lens, 8, points, seed=seed), model)
+    assert ray_errors(found.lens, lens, best=True).median() < 0.3
+    assert 0.15 < found.sigma < 0.25 and found.used.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fov", FOVS)
+def test_errors_are_small_in_the_median_of_rigs(fov):
+    lens = true_lens("KannalaBrandt", fov)
+    errors = [
+        ray_errors(of(rig(lens, 20, seed=s)).lens, lens, best=True).median() for s in range(8)
+    ]
+    assert torch.stack(errors).median() < 0.02
+
+
+def test_exact_corners_give_the_exact_lens_and_poses():
+    true = rig(true_lens("KannalaBrandt", 200), 8, noise=0.0)
+    found = of(true)
+    assert ray_errors(found.lens, true.lens).max() < 1e-4
+    torch.testing.assert_close(found.rotations, true.rotations, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.translations, true.translations, rtol=0, atol=1e-5)
+    seen = ~true.corners.isnan().any(-1)
+    assert found.residuals[seen].abs().max() < 1e-3 and found.residuals[~seen].isnan().all()
+    angles, _ = true.lens.unproject_pixels(true.corners)
+    torch.testing.assert_close(found.theta[seen], angles[seen], rtol=0, atol=1e-5)
+
+
+def test_a_part_of_the_board_is_enough(usual):
+    corners = usual.corners.clone()
+    corners[::2, : len(usual.board) // 2] = math.nan
+    corners[1::2, ::3] = math.nan
+    found = of(usual._replace(corners=corners))
+    used = found.used
+    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.06 and used.sum() >= 10
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_corner_is_named_and_does_no_harm(seed):
+    true = middle_of(seed)
+    corners = true.corners.clone()
+    k = int((~corners[3, :, 0].isnan()).nonzero()[4])
+    corners[3, k] += torch.tensor([12.0, -16.0], dtype=f64) * (1 if corners[3, k, 0] < 500 else -1)
+    found, without = of(true._replace(corners=corners)), of(true)
+    (doubt,) = [text for text in found.doubts if "corner " in text]
+    assert doubt.startswith(f"corner {k + 1} of picture 4 is ") and found.weights[3, k] < 0.01
+    assert ray_errors(found.lens, without.lens, best=True).median() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_picture_is_named_and_does_no_harm(seed):
+    true = middle_of(seed)
+    corners = true.corners.clone()
+    order = torch.randperm(54, generator=torch.Generator().manual_seed(seed))
+    corners[5] = corners[5, order]
+    names = [f"{k}.png" for k in range(12)]
+    found = of(true._replace(corners=corners), names=names)
+    keep = [k for k in range(12) if k != 5]
+    without = of(true._replace(corners=true.corners[keep]))
+    assert found.used.tolist() == [k != 5 for k in range(12)] and not found.weights[5].any()
+    assert [text for text in found.doubts if text.startswith("5.png does not fit: ")]
+    assert ray_errors(found.lens, without.lens).max() < 0.01
+
+
+def test_a_picture_without_corners_is_named(usual):
+    corners = usual.corners.clone()
+    corners[2] = math.nan
+    corners[4, 5:] = math.nan
+    found = of(usual._replace(corners=corners))
+    assert not found.used[[2, 4]].any() and found.rotations[2].isnan().all()
+    assert len([text for text in found.doubts if text.startswith(("picture 3", "picture 5"))]) == 2
+
+
+def test_inputs_of_other_kinds_give_the_same(usual):
+    class Board:
+        points = usual.board.numpy()
+
+    size = tuple(int(side) for side in usual.size)
+    other = calibrate(usual.corners.numpy(), Board(), size, KannalaBrandt)
+    assert other.lens.same_as(of(usual).lens)
+
+
+def test_neither_order_nor_unit_of_length_matters(usual):
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    found, other = of(usual), calibrate(usual.corners[order], 1000 * usual.board, usual.size)
+    assert ray_errors(found.lens, other.lens).max() < 1e-3
+    torch.testing.assert_close(
+        other.translations, 1000 * found.translations[order], rtol=1e-3, atol=0.1
+    )
+
+
+def test_pixels_that_are_not_square():
+    lens = true_lens("KannalaBrandt", 180)
+    lens = lens.replace(affine=torch.tensor([[[1, 0], [0, 1.03]]], dtype=f64))
+    found = of(rig(lens, 15), square_pixels=False)
+    assert abs(found.lens.affine[0, 1, 1] - 1.03) < 1e-3 and "affine[3]" in found.parameters
+    assert ray_errors(found.lens, lens, best=True).median() < 0.03
+
+
+@pytest.mark.parametrize("terms", [1, 3, 5])
+def test_terms(usual, terms):
+    assert of(usual, terms=terms).lens.radial.shape == (1, terms)
+
+
+def test_a_mirrored_board_is_named(usual):
+    corners = usual.corners.reshape(12, 6, 9, 2).flip(2).reshape(12, 54, 2)
+    found = of(usual._replace(corners=corners))
+    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.03
+    assert [text for text in found.doubts if "mirrored" in text and "in 12" in text]
+
+
+def test_theta_max_is_the_sensors_or_where_the_curve_ends(usual):
+    found = of(usual)
+    sides = found.lens.side_angles().max()
+    assert found.lens.theta_max == min(sides, found.lens.theta_limit)
+
+
+def test_it_is_saved_and_described(usual, tmp_path):
+    found = of(usual)
+    described = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert from_dict(described["lens"]).theta_max.item() == pytest.approx(
+        found.lens.theta_max.item()
+    )
+    assert np.shape(described["residuals"]) == (12, 54, 2) and described["sigma"] == found.sigma
+    save(found.lens, tmp_path / "camera.json")
+    assert load(tmp_path / "camera.json", dtype=f64).theta_max.shape == (1,)
+
+
+def test_lines_of_progress(usual):
+    lines = []
+    of(usual, progress=lines.append)
+    assert lines == ["Finding a start from 12 pictures", "Refining a KannalaBrandt lens"]
+
+
+def test_the_best_model_predicts_left_out_pictures(usual):
+    found = of(usual, "auto")
+    table = {model: (left_out, reason) for model, left_out, _, reason in found.models}
+    assert found.models[0][0] == type(found.lens).__name__
+    assert found.left_out == found.models[0][1] <= table["KannalaBrandt"][0]
+    assert table["Equisolid"][0] > 2 * found.left_out
+    assert "the axis, but a Perspective lens ends at 90°" in table["Perspective"][1]
+    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.04
+
+
+def test_left_out_is_the_error_of_pictures_that_were_left_out():
+    true = rig(true_lens("KannalaBrandt", 180), 6, noise=0.5)
+    found = of(true)
+    total, count = 0.0, 0
+    for k in range(6):
+        rest = of(true._replace(corners=true.corners[[i for i in range(6) if i != k]]))
+        # The lens without the picture, and the best pose of the picture in it.
+        from darswin.calibrate.refine import Free, State, Views, refine
+
+        unit = (true.board - true.board.mean(0)).norm(dim=1).max()
+        flat = (true.board - true.board.mean(0)) / unit
+        seen = ~true.corners[k : k + 1].isnan().any(-1)
+        views = Views(
+            true.corners[k : k + 1].nan_to_num(), seen, torch.nn.functional.pad(flat, (0, 1))
+        )
+        middle = torch.nn.functional.pad(true.board.mean(0), (0, 1))
+        shift = (found.translations[k : k + 1] + found.rotations[k : k + 1] @ middle) / unit
+        lens = rest.lens.with_theta_max(None)
+        state = State(rest._vector, lens, found.rotations[k : k + 1], shift)
+        state, _ = refine(views, Free(lens, True), state, lens_moves=False)
+        total += views.miss(state).square().sum().item()
+        count += int(seen.sum())
+    assert found.left_out == pytest.approx(math.sqrt(total / count), rel=0.05)
+    assert found.left_out > found.error
+
+
+def test_left_out_needs_four_pictures():
+    found = of(rig(true_lens("Equidistant", 150), 3), "Equidistant")
+    assert math.isnan(found.left_out) and found.to_dict()["left_out"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "fov"), [("KannalaBrandt", 190), ("Spherical", 100)])
+def test_uncertainty_is_the_scatter_of_repeats(model, fov):
+    lens = true_lens(model, fov)
+    true = rig(lens, 10, noise=0.0)
+    theta = lens.theta_max * torch.linspace(0.1, 0.9, 5, dtype=f64)
+    azimuth = torch.linspace(0, 5, 6, dtype=f64)[:, None]
+    rays = vector_of(
+        theta.expand(6, 5), torch.stack((azimuth.cos(), azimuth.sin()), -1).expand(6, 5, 2)
+    )
+    places, radii, spreads, theta_spreads = [], [], [], []
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(60):
+        noise = 0.3 * torch.randn(true.corners.shape, generator=generator, dtype=f64)
+        found = calibrate(true.corners + noise, true.board, true.size, model)
+        off = found.rotations @ true.rotations.mT
+        vectors = torch.stack(
+            (off[:, 2, 1] - off[:, 1, 2], off[:, 0, 2] - off[:, 2, 0], off[:, 1, 0] - off[:, 0, 1]),
+            1,
+        )
+        mean = turn(vectors.mean(0) / 2)
+        places.append(found.lens.with_theta_max(None).project_points(rays @ mean.T))
+        radii.append(found.lens.project(theta))
+        spreads.append(found.uncertainty(lens.project_points(rays)))
+        theta_spreads.append(found.uncertainty_of_theta(theta))
+    apart = torch.stack(places)
+    apart = (apart - apart.mean(0)).permute(1, 2, 3, 0)
+    scatter = torch.linalg.eigvalsh(apart @ apart.mT / 59)[..., -1].sqrt()
+    ratio = torch.stack(spreads).mean(0) / scatter
+    assert (
+        (ratio.log().mean().exp() - 1).abs() < 0.15 and (ratio < 1.4).all() and (ratio > 0.7).all()
+    )
+    ratio = torch.stack(theta_spreads).mean(0) / torch.stack(radii).std(0)
+    assert (ratio < 1.3).all() and (ratio > 1 / 1.3).all()
+
+
+def test_uncertainty_grows_where_no_corner_was_seen(usual):
+    corners = torch.where(usual.corners[..., :1] > 520, math.nan, usual.corners)
+    narrow, found = of(usual._replace(corners=corners)), of(usual)
+    left, right = narrow.uncertainty([[150.0, 480.0], [900.0, 480.0]])
+    assert right > 1.5 * left and right > 1.5 * found.uncertainty([900.0, 480.0])
+    assert found.uncertainty(torch.zeros(2, 3, 2)).shape == (2, 3)
+    assert found.uncertainty_of_theta(0.5).shape == ()
+
+
+def test_a_wrong_model_ends_in_words(usual):
+    with pytest.raises(
+        CalibrationError, match=r"The corners reach 9\d° from the axis, but a Persp"
+    ):
+        of(usual, "Perspective")

@@ -1,0 +1,151 @@
+"""Corners from which no lens can be found: one sentence, never a crash or a lens of NaN."""
+
+import math
+
+import pytest
+import torch
+from rigs import board, f64, rig, true_lens
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from darswin.calibrate import CalibrationError, calibrate
+
+TRUE = rig(true_lens("KannalaBrandt", 170), 6, least=20)
+CORNERS, BOARD, SIZE = TRUE.corners, TRUE.board, TRUE.size
+
+
+def parallel(fov, one_distance, noise):
+    """Boards that are parallel to the sensor."""
+    generator = torch.Generator().manual_seed(0)
+    lens = true_lens("KannalaBrandt", fov)
+    u = torch.rand(10, 1, 3, generator=generator, dtype=f64)
+    depth = torch.full_like(u[..., 2:], 0.2) if one_distance else 0.2 + 0.3 * u[..., 2:]
+    shift = torch.cat((0.3 * u[..., :2] - 0.15, depth), 2)
+    pixels = lens.project_points(torch.nn.functional.pad(BOARD - BOARD.mean(0), (0, 1)) + shift)
+    inside = ((pixels > 1) & (pixels < 950)).all(-1, keepdim=True)
+    return torch.where(inside, pixels, math.nan) + noise * torch.randn(
+        pixels.shape, generator=generator, dtype=f64
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+@pytest.mark.parametrize("one_distance", [True, False])
+@pytest.mark.parametrize("fov", [60, 190])
+def test_boards_that_are_parallel_to_the_sensor(fov, one_distance, noise):
+    with pytest.raises(CalibrationError, match="nearly parallel to the sensor: tilt them by 20 to"):
+        calibrate(parallel(fov, one_distance, noise), BOARD, SIZE)
+
+
+ERRORS = {
+    "no picture": (CORNERS[:0], BOARD, {}, "At least 3 pictures .* got 0"),
+    "two pictures": (CORNERS[:2], BOARD, {}, "At least 3 pictures .* got 2"),
+    "nothing seen": (CORNERS * math.nan, BOARD, {}, "At least 3 pictures .* got 0"),
+    "one row seen": (
+        torch.where((torch.arange(54) < 9)[:, None], CORNERS, math.nan), BOARD, {}, "on one line"),
+    "another board": (CORNERS, board(7, 5), {}, r"`corners` must be of shape \(P, 35, 2\), got"),
+    "turned board": (CORNERS, board(6, 9), {}, "are the board and the order of its corners right"),
+    "one point": (CORNERS[:, :1], BOARD[:1], {}, "A board needs 8 points or more"),
+    "no point": (CORNERS[:, :0], BOARD[:0], {}, "A board needs 8 points or more"),
+    "a line": (CORNERS[:, :9], BOARD[:9], {}, "not on one line, got 9"),
+    "a spot": (CORNERS, 0 * BOARD, {}, "not on one line"),
+    "another size": (2 * CORNERS, BOARD, {}, r"picture \d has a corner at .* of one size"),
+    "infinity": (CORNERS + math.inf, BOARD, {}, "`corners` must be finite, or NaN"),
+    "infinite board": (CORNERS, BOARD + math.inf, {}, "`board` must be finite"),
+    "flat": (CORNERS[0], BOARD, {}, r"`corners` must be of shape \(P, 54, 2\)"),
+    "solid": (CORNERS, torch.zeros(54, 3), {}, r"`board` must be a Board or points"),
+    "unknown model": (CORNERS, BOARD, {"model": "Kannala"}, "`model`: unknown lens model 'Kannala'"),
+    "names": (CORNERS, BOARD, {"names": ["a"]}, "`names` must be 6 names"),
+    "terms": (CORNERS, BOARD, {"terms": 0}, "`terms` must be 1 to 64"),
+    "one place": (CORNERS * 0 + 300, BOARD, {}, "The pictures do not determine the lens"),
+    "narrow model": (rig(true_lens("KannalaBrandt", 220), 6).corners, BOARD,
+                     {"model": "Orthographic"}, "Orthographic lens ends at 90°"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_errors(case):
+    corners, points, options, words = ERRORS[case]
+    with pytest.raises(ValueError, match=words) as caught:
+        calibrate(corners, points, SIZE, **options)
+    assert str(caught.value).count("\n") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("corners", BOARD, SIZE), "`corners` must be numbers"),
+        ((CORNERS, None, SIZE), "`board` must be numbers"),
+        ((CORNERS, BOARD, SIZE, 3), "model must be a lens class or its name"),
+    ],
+)
+def test_wrong_types(arguments, words):
+    with pytest.raises(TypeError, match=words):
+        calibrate(*arguments)
+
+
+@pytest.mark.parametrize("size", [960, (960,), (960.5, 1000), (0, 1000), "AB"])
+def test_wrong_sizes(size):
+    with pytest.raises(ValueError, match=r"`size` must be \(H, W\) in whole pixels"):
+        calibrate(CORNERS, BOARD, size)
+
+
+def test_boards_at_one_distance_blurred_corners_and_few_pictures_are_doubted():
+    found = calibrate(CORNERS[:1].expand(4, -1, -1), BOARD, SIZE, "Equidistant")
+    assert [text for text in found.doubts if "one distance" in text]
+    assert [text for text in found.doubts if text.startswith("4 pictures are few")]
+    blurred = calibrate(rig(TRUE.lens, 10, noise=2.0).corners, BOARD, SIZE)
+    assert [text for text in blurred.doubts if "px off: the pictures are blurred" in text]
+
+
+def test_corners_in_the_middle_only_are_doubted():
+    lens = true_lens("KannalaBrandt", 190, shift=0.0)
+    narrow = rig(lens.with_theta_max(0.6), 12)
+    found = calibrate(narrow.corners, BOARD, SIZE)
+    assert math.degrees(found.supported) == pytest.approx(math.degrees(0.6), abs=2)
+    assert [text for text in found.doubts if text.startswith("corners reach 3")]
+
+
+MESSES = st.sampled_from(["noise", "nan", "same", "swap", "far", "none", "row"])
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    seed=st.integers(0, 10**6),
+    pictures=st.integers(0, 5),
+    columns=st.integers(1, 5),
+    rows=st.integers(1, 4),
+    fov=st.sampled_from([40.0, 90.0, 170.0, 250.0]),
+    model=st.sampled_from(["KannalaBrandt", "Equidistant", "OCam", "DoubleSphere", "Tabulated"]),
+    messes=st.lists(MESSES, max_size=3),
+)
+def test_any_rig_gives_a_lens_or_words(seed, pictures, columns, rows, fov, model, messes):
+    generator = torch.Generator().manual_seed(seed)
+    true = rig(true_lens("KannalaBrandt", fov, seed=seed), max(pictures, 1), board(columns, rows),
+               seed=seed, least=1)  # fmt: skip
+    corners = true.corners[:pictures].clone()
+    for mess in messes:
+        place = torch.rand(corners.shape[:2], generator=generator) < 0.3
+        if mess == "noise":
+            corners[place] = 900 * torch.rand(corners[place].shape, generator=generator, dtype=f64)
+        elif mess in ("nan", "none", "row"):
+            chosen = {
+                "nan": place,
+                "none": torch.ones_like(place),
+                "row": place[:1].expand_as(place),
+            }
+            corners[chosen[mess]] = math.nan
+        elif mess == "same" and pictures:
+            corners[:] = corners[:1].clone()
+        elif mess == "swap":
+            corners = corners.flip(1)
+        else:
+            corners[place] += 1e3
+    try:
+        found = calibrate(corners, true.board, true.size, model)
+    except CalibrationError as error:
+        assert len(str(error)) > 20 and "nan" not in str(error)
+        return
+    for tensor in found.lens._tensors().values():
+        assert tensor.isfinite().all()
+    assert found.used.sum() >= 3 and math.isfinite(found.sigma) and found.supported > 0
+    assert found.rotations[found.used].isfinite().all() and found.covariance.isfinite().all()
