@@ -3,7 +3,6 @@
 import os
 import re
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,18 +70,24 @@ def _row(*values: float) -> torch.Tensor:
     return torch.tensor([values], dtype=torch.float64)
 
 
-def _of_opencv(model: type[Lens], matrix: np.ndarray, given: Given, **terms) -> np.ndarray:
-    """The rays of a lens that OpenCV found, by our inverse: it is exact where OpenCV's is not."""
+def _of_opencv(model: type[Lens], matrix: np.ndarray, size: tuple[int, int], **terms) -> Lens:
+    """A lens that OpenCV found. Our inverse is exact where OpenCV's is not."""
     (fx, skew, cx), (_, fy, cy), _ = matrix
     affine = torch.tensor([[[1.0, skew / fx], [0.0, fy / fx]]], dtype=torch.float64)
     try:
-        lens = model(
-            focal=_row(fx)[0], affine=affine, center=_row(cx, cy), image_size=_row(*given.size),
-            **terms,
-        )  # fmt: skip
+        return model(
+            focal=_row(fx)[0], affine=affine, center=_row(cx, cy), image_size=_row(*size), **terms
+        )
     except ValueError as error:
         raise FailedError(f"no camera has such numbers: {error}") from None
-    return _rays(lens, given.pixels)
+
+
+def lens_of_brown(matrix: np.ndarray, d: np.ndarray, size: tuple[int, int]) -> Lens:
+    """The lens of a camera matrix and the 5 or 8 coefficients of `cv2.calibrateCamera`."""
+    terms = dict(radial=_row(d[0], d[1], d[4]), tangential=_row(d[2], d[3]))
+    if len(d) >= 8:
+        terms["denominator"] = _row(*d[5:8])
+    return _of_opencv(BrownConrady, matrix, size, **terms)
 
 
 def pinhole(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
@@ -90,11 +95,8 @@ def pinhole(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
 
     def method(given: Given) -> np.ndarray:
         corners = given.within(limit)
-        matrix, d = brown(corners, given.board, given.size, flags)
-        terms = dict(radial=_row(d[0], d[1], d[4]), tangential=_row(d[2], d[3]))
-        if len(d) >= 8:
-            terms["denominator"] = _row(*d[5:8])
-        return _of_opencv(BrownConrady, matrix, given, **terms)
+        found = brown(corners, given.board, given.size, flags)
+        return _rays(lens_of_brown(*found, given.size), given.pixels)
 
     return method
 
@@ -140,7 +142,8 @@ def fisheye(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
                 del left[int(ill[1])]
         if not (np.isfinite(matrix).all() and np.isfinite(d).all()):
             raise FailedError("the numbers are not finite")
-        return _of_opencv(KannalaBrandt, matrix, given, radial=_row(*d.ravel()))
+        lens = _of_opencv(KannalaBrandt, matrix, given.size, radial=_row(*d.ravel()))
+        return _rays(lens, given.pixels)
 
     return method
 
@@ -166,8 +169,8 @@ def _program(command: list[str], given: Given, corners: np.ndarray) -> dict[str,
 def omnidir(given: Given) -> np.ndarray:
     found = _program([OMNIDIR, str(FOLDER / "calibrate_omnidir.py")], given, given.corners)
     matrix, xi, d = found["matrix"], float(found["xi"].squeeze()), found["distortion"].ravel()
-    terms = dict(radial=_row(d[0], d[1]), tangential=_row(d[2], d[3]))
-    return _of_opencv(Mei, matrix, given, xi=_row(xi)[0], **terms)
+    terms = dict(xi=_row(xi)[0], radial=_row(d[0], d[1]), tangential=_row(d[2], d[3]))
+    return _rays(_of_opencv(Mei, matrix, given.size, **terms), given.pixels)
 
 
 def mrcal(model: str, limit: float) -> Callable[[Given], np.ndarray]:
@@ -186,15 +189,17 @@ FLAGS = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
 CHECKED = FLAGS | cv2.CALIB_CHECK_COND
 GUESS = FLAGS | cv2.CALIB_USE_INTRINSIC_GUESS
 OURS = {"ours, KannalaBrandt": ours("KannalaBrandt"), "ours, auto": ours("auto")}
+# Each with the limit that served it best on the whole.
 PEERS = {
-    "cv2.calibrateCamera": pinhole(0, 70),
-    "cv2.calibrateCamera, rational": pinhole(cv2.CALIB_RATIONAL_MODEL, 70),
+    "cv2.calibrateCamera": pinhole(0, 60),
+    "cv2.calibrateCamera, rational": pinhole(cv2.CALIB_RATIONAL_MODEL, 80),
     "cv2.fisheye": fisheye(0, 85),
     "cv2.fisheye, flags": fisheye(FLAGS, 85),
-    "cv2.fisheye, all flags": fisheye(CHECKED, 85),
+    "cv2.fisheye, flags and check": fisheye(CHECKED, 85),
+    "cv2.fisheye, flags and guess": fisheye(GUESS, 180),
     "cv2.omnidir": omnidir,
-    "mrcal, OPENCV8": mrcal("OPENCV8", 85),
-    "mrcal, splined": mrcal(SPLINED, 85),
+    "mrcal, OPENCV8": mrcal("OPENCV8", 180),
+    "mrcal, splined": mrcal(SPLINED, 180),
 }
 METHODS = OURS | PEERS
 
@@ -216,7 +221,3 @@ def versions() -> dict[str, str]:
         asked = ["dpkg-query", "--show", "--showformat=${Version}", "mrcal"]
         found["mrcal"] = subprocess.run(asked, capture_output=True, text=True).stdout
     return found
-
-
-if __name__ == "__main__":
-    print(versions(), file=sys.stderr)
