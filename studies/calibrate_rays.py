@@ -31,23 +31,33 @@ class Set(NamedTuple):
     compared: bool = False
 
 
+QUICK = (
+    Set("KannalaBrandt", 150, 8, compared=True),
+    Set("Spherical", 220, 20),
+    Set("BrownConrady", 60, 5),
+)
+
+
 def fovs(model: str) -> list[int]:
     """The fields of view that a model can show."""
     return [fov for fov in FOVS if _lens(model, fov, 0) is not None]
 
 
 def all_sets() -> list[Set]:
-    """Each model with every second field of view and 20 pictures; and each with 5, 8 and 30
-    pictures, with others in turn; and half of the models without noise."""
-    sets = []
-    for k, model in enumerate(MODELS):
-        able = fovs(model)
-        mine = able[k % 2 :: 2] or able
-        sets += [Set(model, fov, compared=fov == mine[k // 2 % len(mine)]) for fov in mine]
-        sets += [Set(model, able[(k + i) % len(able)], n) for i, n in enumerate((5, 8, 30))]
+    """Each model with every second field of view and 20 pictures; then half of the models without
+    noise, and each with 5, 8 and 30 pictures, with one field of view after the other."""
+    able = {model: fovs(model) for model in MODELS}
+    first, others = [], []
+    for k, (model, known) in enumerate(able.items()):
+        mine = known[k % 2 :: 2]
+        first += [Set(model, fov, compared=fov == mine[k // 2 % len(mine)]) for fov in mine]
         if k % 2:
-            sets.append(Set(model, able[k % len(able)], noise=0.0))
-    return sets
+            first.append(Set(model, known[k % len(known)], noise=0.0))
+    for i, count in enumerate((8, 5, 30)):
+        others += [
+            Set(m, known[(k + i) % len(known)], count) for k, (m, known) in enumerate(able.items())
+        ]
+    return first + others
 
 
 def _lens(model: str, fov: int, seed: int) -> Lens | None:
