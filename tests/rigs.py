@@ -5,6 +5,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from numpy.polynomial import Polynomial
 from torch import Tensor
 
 from darswin.lens import MODELS, EnhancedUnified, Lens, fit
@@ -49,12 +50,14 @@ def true_lens(
         torch.tensor([0.4 + 0.2 * alpha], dtype=f64), 0.9 + 0.4 * beta, math.radians(fov),
         min(size) / 2,
     )  # fmt: skip
-    lens = fit(MODELS[model], base).lens
+    lens = fit(MODELS["Polynomial" if model == "OCamInverse" else model], base).lens
     if model == "OCamInverse":  # of a fit, r(0) is not 0
-        lens.coefficients[:, 0] -= lens.project(0.0)
+        shifted = Polynomial([0, *lens.coefficients[0].tolist()])(Polynomial([math.pi / 2, 1]))
+        lens = MODELS[model](torch.from_numpy(shifted.coef), base.theta_max)
     for name, count in OFF_CURVE.get(model, {}).items():
         off = 2e-3 * (2 * torch.rand(1, count, generator=generator, dtype=f64) - 1)
         lens = lens.replace(**{name: off})
+    lens = lens.with_theta_max(torch.minimum(lens.theta_max, 0.98 * lens.theta_limit))
     center = torch.tensor(
         [
             [
@@ -92,7 +95,7 @@ def rig(
     height, width = (round(side) for side in lens.image_size[0].tolist())
     theta_max = lens.theta_max.item()
     middle = points.mean(0)
-    half = (points - middle).norm(dim=1).max()
+    half = (points - middle).norm(dim=1).max().clamp(min=0.01)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     while len(found) < pictures:
         u = torch.rand(7, generator=generator, dtype=f64)

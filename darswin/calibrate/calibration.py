@@ -10,6 +10,13 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate import radial
+from darswin.calibrate.inputs import (
+    LEAST_CORNERS,
+    LEAST_PICTURES,
+    CalibrationError,
+    checked,
+    usable_pictures,
+)
 from darswin.calibrate.refine import (
     MEDIAN,
     Free,
@@ -20,33 +27,19 @@ from darswin.calibrate.refine import (
     refine,
     weights_of,
 )
-from darswin.lens import (
-    MODELS,
-    BrownConrady,
-    Fisheye624,
-    Lens,
-    Mei,
-    OCam,
-    Tabulated,
-    to_dict,
-)
+from darswin.lens import MODELS, Lens, to_dict
 from darswin.lens.base import unknown_model
 from darswin.lens.files.load import reach
-from darswin.lens.fitting import fit_one
-from darswin.lens.ideal import FocalLens
 from darswin.utils.parameters import check, naming
 
-# What "auto" tries; and the terms off the curve that are found for a model.
+# What "auto" tries.
 CANDIDATES = (
     "Perspective", "Equidistant", "Equisolid", "Stereographic", "FieldOfView", "EnhancedUnified",
     "KannalaBrandt", "OCam", "BrownConrady", "Mei", "Fisheye624",
 )  # fmt: skip
-ASIDE: dict[type[Lens], dict[str, int]] = {
-    BrownConrady: {"tangential": 2}, Mei: {"tangential": 2},
-    Fisheye624: {"tangential": 2, "prism": 4},
-}  # fmt: skip
-TABLE = 12  # the steps of a table
-LEAST_CORNERS, LEAST_PICTURES = 8, 3
+# The terms off the curve that are found for a model.
+ASIDE = {"BrownConrady": {"tangential": 2}, "Mei": {"tangential": 2},
+         "Fisheye624": {"tangential": 2, "prism": 4}}  # fmt: skip
 OFF = 6.0  # standard deviations: a corner this far off does not fit
 SHARPEST = 0.05  # px: no detector finds corners better than this
 # For doubts.
@@ -56,10 +49,6 @@ WRONG = 0.02  # of the picture's side: a corner's standard deviation
 ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
 COVERED = 0.8  # of theta_max
 SHOWN = 10  # corners
-
-
-class CalibrationError(ValueError):
-    """Corners from which no lens can be found; the message is one sentence for the user."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -183,25 +172,27 @@ def calibrate(
             unknown model. TypeError: an argument of another kind.
     """
     say = progress or (lambda line: None)
-    whole, points = _checked(corners, board, size)
+    whole, points = checked(corners, board, size)
     count = len(whole.seen)
     names = [f"picture {k + 1}" for k in range(count)] if names is None else [*names]
     check("names", names, len(names) == count, f"{count} names, one for each picture")
     kinds = [_kind(name) for name in (CANDIDATES if model == "auto" else [model])]
     if terms is not None:
         check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
-    usable = _usable(whole, size, names)
+    usable = usable_pictures(whole, size, names)
     views = whole._replace(corners=whole.corners[usable], seen=whole.seen[usable])
     say(f"Finding a start from {len(views.seen)} pictures")
     start = radial.start(views.corners, views.seen, views.board[:, :2], size)
     found: list[_Found] = []
     failed: list[tuple[str, float, float, str]] = []
     for kind in kinds:
-        say(f"Refining a {kind.__name__} lens")
+        say(f"Refining the lens: {kind.__name__}")
         try:
             found.append(_find(kind, terms, views, start, size, square_pixels))
         except (CalibrationError, torch.linalg.LinAlgError) as error:
-            reason = error if isinstance(error, CalibrationError) else "The equations fail."
+            reason = (
+                error if isinstance(error, CalibrationError) else "Its equations have no solution."
+            )
             failed.append((kind.__name__, math.nan, math.nan, str(reason)))
     if not found:
         raise CalibrationError(failed[0][3])
@@ -276,16 +267,26 @@ class _Found:
 
     def judge(self, views: Views, counts: Tensor) -> None:
         """Computes the covariance and the errors, over the corners that count, (P, K)."""
-        used = counts.any(1)
+        used, (vector, lens, rotations, translations) = counts.any(1), self.state
         views = Views(views.corners[used], views.seen[used], views.board)
-        state, miss, counts = self.state.of(used), self.miss[used], counts[used]
+        state = State(vector, lens, rotations[used], translations[used])
+        miss, counts = self.miss[used], counts[used]
         slopes = views.slopes(self.free, state)
-        normal = Normal(slopes, miss, counts.to(miss), self.free, state.vector).damped(0.0)
+        normal = Normal(slopes, miss, counts.to(miss), self.free, vector).damped(0.0)
         self.joint = self.sigma**2 * normal.covariance()
         self.error = miss[counts].square().sum(-1).mean().sqrt().item()
         if len(miss) > LEAST_PICTURES:
             moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
             self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
+
+
+def _state(lens: Lens, square_pixels: bool, poses: tuple[Tensor, Tensor]) -> tuple[Free, State]:
+    """The free numbers of a lens, and the state with these poses."""
+    free = Free(lens, square_pixels)
+    whole = free.lens(free.start)
+    if whole is None:
+        raise CalibrationError(f"No {free.model.__name__} lens is close to the start.")
+    return free, State(free.start, whole, *poses)
 
 
 def _find(
@@ -296,11 +297,12 @@ def _find(
     rays, used, board = start.rays(views.corners), start.fits, views.board[:, :2]
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
-    free = Free(_start_lens(model, terms, start, top, size), square_pixels)
-    lens = free.lens(free.start)
-    if lens is None:
-        raise CalibrationError(f"No {model.__name__} lens is close to the start.")
-    state = State(free.start, lens, *radial.poses(rays, views.seen.to(rays), board))
+    poses = radial.poses(rays, views.seen.to(rays), board)
+    free, state = _state(start.lens(model, terms, top, size), square_pixels, poses)
+    if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
+        state, _ = refine(views._replace(seen=views.seen & used[:, None]), free, state)
+        zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
+        free, state = _state(state.lens.replace(**zeros), square_pixels, state[2:])
     for _ in range(4):
         counts = views.seen & used[:, None]
         state, scale = refine(views._replace(seen=counts), free, state)
@@ -311,7 +313,10 @@ def _find(
         again, _ = refine(views, free, again, lens_moves=False)
         loss, other = (losses(views.miss(x), scale).sum(1) for x in (state, again))
         better = other < loss - 0.1
-        state = state.with_poses(better, again)
+        state = state._replace(
+            rotations=torch.where(better[:, None, None], again.rotations, state.rotations),
+            translations=torch.where(better[:, None], again.translations, state.translations),
+        )
         distance = views.miss(state).norm(dim=-1)
         typical = torch.where(views.seen, distance, torch.nan).nanmedian(1).values
         sigma = max(distance[counts].median().item() / MEDIAN, SHARPEST)
@@ -324,33 +329,6 @@ def _find(
         if torch.equal(before, used) and not better[used].any():
             break
     return _Found(free, state, scale, views, used)
-
-
-def _start_lens(
-    model: type[Lens], terms: int | None, start: radial.Start, top: float, size: tuple[int, int]
-) -> Lens:
-    """The lens of a model that is close to the start up to the angle `top`, rad."""
-    end = model._end if issubclass(model, FocalLens) else math.pi
-    if top > end + 0.05:
-        raise CalibrationError(
-            f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
-            f"lens ends at {math.degrees(end):.0f}°: choose another model."
-        )
-    image = {"center": start.center[None], "image_size": start.center.new_tensor([size])}
-    curve = OCam(-start.depth[None], **image)
-    limit = curve.theta_limit.item()
-    if issubclass(model, Tabulated):
-        angles = torch.linspace(0, min(1.03 * top + 0.02, limit), (terms or TABLE) + 1)
-        return Tabulated(angles.to(curve.center), curve.project(angles.to(curve.center)), **image)
-    for share in (1.0, 0.9, 0.7, 0.5):
-        short = curve.with_theta_max(share * min(top, limit, 0.97 * end))
-        try:
-            found = fit_one(model, short, model.terms if terms is None else terms, rounds=20)
-        except ValueError:
-            continue
-        aside = {name: start.center.new_zeros(1, n) for name, n in ASIDE.get(model, {}).items()}
-        return model(**found._tensors() | aside | image | {"theta_max": None})
-    raise CalibrationError(f"No {model.__name__} lens is close to the start: try another model.")
 
 
 def _doubts(found: Calibration, views: Views, best: _Found, place: Tensor) -> list[str]:
@@ -409,61 +387,3 @@ def _doubts(found: Calibration, views: Views, best: _Found, place: Tensor) -> li
             f"{math.degrees(end):.0f}°: in between, the lens is a guess"
         )
     return said
-
-
-def _numbers(name: str, value: Any) -> Tensor:
-    try:
-        return torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise naming(TypeError(f"`{name}` must be numbers, got {value!r:.200}"), name) from error
-
-
-def _checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Tensor]:
-    """The views, of a board with its middle at 0 and a size of 1, and the board's points."""
-    points = _numbers("board", getattr(board, "points", board))
-    shaped = points.dim() == 2 and points.shape[1] == 2
-    check("board", tuple(points.shape), shaped, "a Board or points of shape (K, 2)")
-    check("board", points.tolist(), bool(points.isfinite().all()), "finite")
-    found, shape = _numbers("corners", corners), (len(points), 2)
-    shaped = found.dim() == 3 and found.shape[1:] == shape
-    check("corners", tuple(found.shape), shaped, f"of shape (P, {len(points)}, 2)")
-    check("corners", "infinity", not bool(found.isinf().any()), "finite, or NaN where not seen")
-    whole = isinstance(size, tuple | list | torch.Size) and len(size) == 2
-    whole = whole and all(isinstance(side, int) and side > 0 for side in size)
-    check("size", size, whole, "(H, W) in whole pixels")
-    seen = ~found.isnan().any(-1)
-    flat = points - points.mean(0)
-    flat = flat / flat.norm(dim=1).amax().clamp(min=1e-300) if len(points) else flat
-    if not _spans(flat, torch.ones(len(flat)).bool()):
-        raise CalibrationError(
-            f"A board needs {LEAST_CORNERS} points or more, not on one line, got {len(points)}."
-        )
-    board = torch.nn.functional.pad(flat, (0, 1))
-    return Views(torch.where(seen[..., None], found, 0.0), seen, board), points
-
-
-def _spans(flat: Tensor, seen: Tensor) -> Tensor:
-    """(...) bool: enough of the points (K, 2) are seen, (..., K), and they are not on one line."""
-    count, part = seen.sum(-1), seen[..., None] * flat
-    apart = part - seen[..., None] * part.sum(-2, keepdim=True) / count[..., None, None].clamp(1)
-    thin = torch.linalg.eigvalsh(apart.mT @ apart)[..., 0] < 1e-3 * count / max(len(flat), 1)
-    return (count >= LEAST_CORNERS) & ~thin
-
-
-def _usable(views: Views, size: tuple[int, int], names: list[str]) -> Tensor:
-    """(P,) bool: the pictures with enough corners, not all on one line."""
-    sides = views.corners.new_tensor([size[1], size[0]])
-    outside = ((views.corners < -1) | (views.corners > sides)).any(-1) & views.seen
-    for k, i in outside.nonzero()[:1].tolist():
-        x, y = views.corners[k, i].tolist()
-        raise CalibrationError(
-            f"{names[k]} has a corner at ({x:.4g}, {y:.4g}), outside of a picture of "
-            f"{size[1]}×{size[0]} (W×H) px: all pictures must be of one size."
-        )
-    usable = _spans(views.board[:, :2], views.seen)
-    if usable.sum() < LEAST_PICTURES:
-        raise CalibrationError(
-            f"At least {LEAST_PICTURES} pictures that show {LEAST_CORNERS} corners, not on one "
-            f"line, are needed, got {int(usable.sum())}: take 10 to 20 pictures."
-        )
-    return usable

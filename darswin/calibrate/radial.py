@@ -13,10 +13,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from darswin.calibrate.inputs import CalibrationError
+from darswin.lens import Lens, OCam, Tabulated
+from darswin.lens.fitting import fit_one
+from darswin.lens.ideal import FocalLens
 from darswin.lens.solve import length_of
 
 POWERS = (0, 2, 3, 4)  # of ρ in the depth g(ρ); a linear term would be a kink at the axis
-PRIOR = 0.04  # how far the principal point is expected from the middle, in parts of the side
+PRIOR = 0.02  # how far the principal point is expected from the middle, in parts of the side
+TABLE = 12  # the steps of a table
 FLOOR = 0.05  # px: smaller residuals say nothing
 
 
@@ -41,6 +46,30 @@ class Start(NamedTuple):
         for coefficient in self.depth.flip(0):
             depth = depth * length_of(flat) + coefficient
         return torch.nn.functional.normalize(torch.cat((flat, depth[..., None]), -1), dim=-1)
+
+    def lens(self, model: type[Lens], terms: int | None, top: float, size: tuple[int, int]) -> Lens:
+        """The lens of a model that is close to the curve up to the angle `top`, rad."""
+        end = model._end if issubclass(model, FocalLens) else math.pi
+        if top > end + 0.05:
+            raise CalibrationError(
+                f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
+                f"lens ends at {math.degrees(end):.0f}°: choose another model."
+            )
+        image = {"center": self.center[None], "image_size": self.center.new_tensor([size])}
+        curve = OCam(-self.depth[None], **image)
+        limit = curve.theta_limit.item()
+        if issubclass(model, Tabulated):
+            last = min(1.03 * top + 0.02, limit)
+            angles = torch.linspace(0, last, (terms or TABLE) + 1).to(self.center)
+            return Tabulated(angles, curve.project(angles), **image)
+        for share in (1.0, 0.9, 0.7, 0.5):
+            short = curve.with_theta_max(share * min(top, limit, 0.97 * end))
+            try:
+                found = fit_one(model, short, terms or model.terms, rounds=20)._tensors()
+                return model(**found | image | {"theta_max": None})
+            except ValueError:
+                continue
+        raise CalibrationError(f"No {model.__name__} lens is close to the start.")
 
 
 def start(corners: Tensor, seen: Tensor, points: Tensor, size: tuple[int, int]) -> Start:

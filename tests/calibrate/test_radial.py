@@ -35,10 +35,10 @@ def test_rays_of_exact_corners(model, fov):
     assert start.error.max() < 0.1 and start.fits.all()
 
 
-def test_a_pinhole_does_not_tell_its_center_so_it_starts_in_the_middle():
+def test_a_pinhole_does_not_tell_its_center_so_it_starts_near_the_middle():
     lens = true_lens("Perspective", 70)
     start, _, _ = started(rig(lens, 10))
-    assert (start.center - torch.tensor([499.5, 479.5], dtype=f64)).norm() < 80
+    assert (start.center - torch.tensor([499.5, 479.5], dtype=f64)).norm() < 120
 
 
 def test_poses_are_exact_in_front_and_behind():
