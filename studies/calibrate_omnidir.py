@@ -17,7 +17,7 @@ def main() -> None:
     points = [data["points"][None]] * len(data["corners"])
     corners = [picture[None] for picture in data["corners"]]
     height, width = (int(side) for side in data["size"])
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-8)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 500, 1e-10)
     try:
         error, matrix, xi, distortion, *_, used = cv2.omnidir.calibrate(
             points, corners, (width, height), None, None, None, cv2.omnidir.CALIB_FIX_SKEW, stop
