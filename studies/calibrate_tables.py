@@ -59,10 +59,16 @@ def _share(results: list[dict]) -> str:
     return f"{sum(map(succeeded, results))}/{len(results)}" if results else "–"
 
 
+def _number(degrees: float) -> str:
+    """In thousandths of a degree."""
+    value = 1000 * degrees
+    return "< 0.05" if value < 0.05 else f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
+
+
 def _angle(values: Iterable[float]) -> str:
-    """The median of angles, in thousandths of a degree."""
+    """The median of angles."""
     values = list(values)
-    return f"{1000 * statistics.median(values):.3g}" if values else "–"
+    return _number(statistics.median(values)) if values else "–"
 
 
 def _medians(results: list[dict]) -> str:
@@ -176,15 +182,15 @@ def best_other(results: dict) -> tuple[str, float] | None:
 
 
 def by_model(record: dict) -> str:
-    """The one set of each model that "auto" gets, too."""
+    """The sets with 20 pictures and noise that "auto" gets, too."""
     rows = []
     for of in filter(lambda of: _usual(of) and of["compared"], record["sets"]):
         best = best_other(of["results"])
         cells = [
-            f"{1000 * of['results'][n]['median']:.3g}" if succeeded(of["results"][n]) else "–"
+            _number(of["results"][n]["median"]) if succeeded(of["results"][n]) else "–"
             for n in (OURS, AUTO)
         ]
-        other = "–" if best is None else f"{1000 * best[1]:.3g}, {best[0]}"
+        other = "–" if best is None else f"{_number(best[1])}, {best[0]}"
         rows.append([of["model"], f"{of['fov']}°", *cells, other])
     heads = ["true lens", "field of view", OURS, AUTO, "best of the others"]
     return markdown(heads, rows)
