@@ -58,15 +58,9 @@ def true_lens(
         off = 2e-3 * (2 * torch.rand(1, count, generator=generator, dtype=f64) - 1)
         lens = lens.replace(**{name: off})
     lens = lens.with_theta_max(torch.minimum(lens.theta_max, 0.98 * lens.theta_limit))
-    center = torch.tensor(
-        [
-            [
-                size[1] * (0.5 + shift * (2 * x - 1)) - 0.5,
-                size[0] * (0.5 + shift * (2 * y - 1)) - 0.5,
-            ]
-        ],
-        dtype=f64,
-    )
+    sides = torch.tensor([size[1], size[0]], dtype=f64)
+    off = 2 * torch.tensor([x, y], dtype=f64) - 1
+    center = ((sides - 1) / 2 + shift * off * sides)[None]
     return lens.replace(center=center, image_size=torch.tensor([size], dtype=f64))
 
 

@@ -1,6 +1,10 @@
-"""Calibration: from pictures of boards to a lens."""
+"""Calibration: from pictures of boards, or of straight lines, to a lens."""
 
 from darswin.calibrate.boards import Board, find_corners
 from darswin.calibrate.calibration import Calibration, CalibrationError, calibrate
+from darswin.calibrate.lines import Estimate, estimate
 
-__all__ = ["Board", "Calibration", "CalibrationError", "calibrate", "find_corners"]
+__all__ = [
+    "Board", "Calibration", "CalibrationError", "Estimate", "calibrate", "estimate",
+    "find_corners",
+]  # fmt: skip

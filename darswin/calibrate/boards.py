@@ -16,7 +16,7 @@ Kind = Literal["chessboard", "charuco", "april"]
 Found = tuple[Sequence[np.ndarray], np.ndarray | None]  # corners, and their numbers
 
 SIDE = 1200  # px, to which larger pictures are reduced at first
-MOST_CHANGE = 0.45  # of a step between corners to the next, in steps; a rim of 125° has 0.33
+MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] |
     if dark > 0.25 * middle:
         return None
     there = light > dark + max(4.0, 0.15 * (middle - dark))
-    rows, columns = there.any(1).nonzero()[0], there.any(0).nonzero()[0]
+    rows, columns = np.flatnonzero(there.any(1)), np.flatnonzero(there.any(0))
     x = [there.argmax(1)[rows], width - 1 - there[:, ::-1].argmax(1)[rows], columns, columns]
     y = [rows, rows, there.argmax(0)[columns], height - 1 - there[::-1].argmax(0)[columns]]
     rim = np.stack((np.concatenate(x), np.concatenate(y)), 1).astype(np.float64)
@@ -218,11 +218,27 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     ):
         for tried, scale in _scales(grey):
             there, corners = detect(tried, (board.columns, board.rows), flags=flags)
-            if there:
-                grid = _shaped(corners.astype(np.float64), board)
+            if not there:
+                continue
+            grid = _shaped(corners.astype(np.float64), board)
+            # The outer ends of a smaller board's squares are no corners, a whole line of them.
+            if (~_are_saddles(tried, grid)).sum() < min(board.rows, board.columns) / 2:
                 turn = _cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
                 # A chessboard looks the same from its other end, but is never mirrored.
                 yield ((grid if turn.mean() > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
+
+
+def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """(rows, columns): True if two opposite squares at a corner are darker than the others."""
+    across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
+
+    def light(aside: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis((grid + aside).astype(np.float32), 2, 0)
+        return cv2.remap(grey, x, y, cv2.INTER_LINEAR)
+
+    both, other = across + down, across - down
+    a, b, c, d = light(both), light(-both), light(other), light(-other)
+    return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))
 
 
 def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:

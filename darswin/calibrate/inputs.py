@@ -39,7 +39,7 @@ def checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Ten
     seen = ~found.isnan().any(-1)
     flat = points - points.mean(0)
     flat = flat / flat.norm(dim=1).amax().clamp(min=1e-300) if len(points) else flat
-    if not _spans(flat, torch.ones(len(flat)).bool()):
+    if not _spans(flat, torch.ones(len(flat)).bool(), 1e-4):
         raise CalibrationError(
             f"A board needs {LEAST_CORNERS} points or more, not on one line, got {len(points)}."
         )
@@ -47,12 +47,14 @@ def checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Ten
     return Views(torch.where(seen[..., None], found, 0.0), seen, board), points
 
 
-def _spans(flat: Tensor, seen: Tensor) -> Tensor:
-    """(...) bool: enough of the points (K, 2) are seen, (..., K), and they are not on one line."""
-    count, part = seen.sum(-1), seen[..., None] * flat
-    apart = part - seen[..., None] * part.sum(-2, keepdim=True) / count[..., None, None].clamp(1)
-    thin = torch.linalg.eigvalsh(apart.mT @ apart)[..., 0] < 1e-3 * count / max(len(flat), 1)
-    return (count >= LEAST_CORNERS) & ~thin
+def _spans(places: Tensor, seen: Tensor, least: float) -> Tensor:
+    """(...) bool: enough of the places (..., K, 2) are seen, (..., K), and they are not on one
+    line: their mean square distance from a line is at least `least`."""
+    count = seen.sum(-1).clamp(min=1)[..., None, None]
+    places = torch.where(seen[..., None], places, 0.0)
+    apart = torch.where(seen[..., None], places - places.sum(-2, keepdim=True) / count, 0.0)
+    thin = torch.linalg.eigvalsh(apart.mT @ apart / count)[..., 0] < least
+    return (seen.sum(-1) >= LEAST_CORNERS) & ~thin
 
 
 def usable_pictures(views: Views, size: tuple[int, int], names: list[str]) -> Tensor:
@@ -65,7 +67,7 @@ def usable_pictures(views: Views, size: tuple[int, int], names: list[str]) -> Te
             f"{names[k]} has a corner at ({x:.4g}, {y:.4g}), outside of a picture of "
             f"{size[1]}×{size[0]} (W×H) px: all pictures must be of one size."
         )
-    usable = _spans(views.board[:, :2], views.seen)
+    usable = _spans(views.board[:, :2], views.seen, 1e-4) & _spans(views.corners, views.seen, 1.0)
     if usable.sum() < LEAST_PICTURES:
         raise CalibrationError(
             f"At least {LEAST_PICTURES} pictures that show {LEAST_CORNERS} corners, not on one "

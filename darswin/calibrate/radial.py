@@ -130,42 +130,37 @@ def _depth(radius: Tensor, seen: Tensor, plane: Tensor, board: Tensor) -> Tensor
     gap = second.square().sum(-1) - first.square().sum(-1)
     tilt = torch.complex(gap, -2 * (first * second).sum(-1)).sqrt()
     scale = (first.square().sum(-1) + tilt.real.square()).sqrt()
-    tilt = torch.view_as_real(tilt / scale[:, None].squeeze(-1))
+    tilt = torch.view_as_real(tilt / scale)
     across = length_of(board @ plane.mT) / scale[:, None]
     leaning = tilt @ board[:, :2].T
     unit = torch.where(seen, radius, 0).max()
     rho = torch.where(seen, radius / unit, 0)
     # Boards almost parallel to the sensor say little: rounding decides their tilt.
     steep = tilt.square().sum(-1)
-    picture = steep / (steep + 0.01) / across.amax(1).square()
+    sure = seen * (steep / (steep + 0.01))[:, None]
     line = torch.linspace(0, 1, 200, dtype=rho.dtype)
     for terms in range(len(POWERS), 0, -1):
         powers = torch.tensor(POWERS[:terms], dtype=rho.dtype)
-        weight = seen * picture[:, None]
+        weight = sure / across.amax(1, keepdim=True).square()
         for _ in range(3):
             columns = across[..., None] * rho[..., None] ** powers
             known = rho * leaning
             # Each picture's Z is eliminated.
-            norm = (weight * rho * rho).sum(1).clamp(min=1e-30)
-            along = (weight * rho)[..., None]
-            columns = columns - rho[..., None] * ((along * columns).sum(1) / norm[:, None])[:, None]
-            known = known - rho * ((along[..., 0] * known).sum(1) / norm)[:, None]
+            along = weight * rho / (weight * rho * rho).sum(1, keepdim=True).clamp(min=1e-30)
+            columns = columns - rho[..., None] * torch.einsum("pk,pkm->pm", along, columns)[:, None]
+            known = known - rho * (along * known).sum(1, keepdim=True)
             right = torch.einsum("pk,pkm,pk->pm", weight, columns, known)
             left = torch.einsum("pk,pkm,pkn->mn", weight, columns, columns)
             left = left + 1e-12 * left.diagonal().mean() * torch.eye(terms, dtype=rho.dtype)
-            signs = _signs(right, torch.linalg.solve(left, right.T))
-            solved = torch.linalg.solve(left, right.T @ signs)
-            solved, signs = (solved, signs) if solved[0] > 0 else (-solved, -signs)
+            solved = torch.linalg.solve(left, right.T)
+            solved = solved @ _signs(right, solved)
+            solved = solved if solved[0] > 0 else -solved
             # A shift of ρ by one changes the equation by Z - √(X² + Y²) g′(ρ).
             depth = (rho[..., None] ** powers) @ solved
             bends = (powers * rho[..., None].clamp(min=1e-6) ** (powers - 1)) @ solved
             far = across * (depth / rho.clamp(min=1e-6) - bends)
             typical = torch.where(seen, far.abs(), torch.nan).nanmedian(1, keepdim=True).values
-            weight = (
-                seen
-                * (steep / (steep + 0.01))[:, None]
-                / far.square().clamp(min=0.05 * typical.square())
-            )
+            weight = sure / far.square().clamp(min=0.05 * typical.square())
         angle = torch.atan2(line, (line[:, None] ** powers) @ solved)
         if solved[0] > 0 and bool((angle.diff() > 0).all()):
             break

@@ -214,9 +214,7 @@ def _inverse(matrix: Tensor) -> Tensor:
     return (vectors / values[..., None, :]) @ vectors.mT
 
 
-def refine(
-    views: Views, free: Free, state: State, lens_moves: bool = True
-) -> tuple[State, float]:  # fmt: skip
+def refine(views: Views, free: Free, state: State, lens_moves: bool = True) -> tuple[State, float]:
     """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss."""
     miss = views.miss(state)
     damping, scale, fine, still = 1e-3, math.inf, False, 0

@@ -17,7 +17,6 @@ from darswin.utils.files import replace_file
 from darswin.utils.parameters import check
 
 if TYPE_CHECKING:
-
     from darswin.calibrate import Board, Calibration
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
@@ -90,7 +89,7 @@ def calibrate(
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
 
-        save_figure(draw_calibration(found, lens), picture)
+        save_figure(draw_calibration(found, seen.corners, lens), picture)
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
@@ -138,7 +137,7 @@ class _Seen:
     """What the pictures show.
 
     Attributes: names, corners, widths: of the pictures with the board, and of its edges (px);
-    without: the other pictures; size: (H, W) of all; brightest: the maximum of all.
+    without: the other pictures; size: (H, W) of all; brightest: the maximum of those with it.
     """
 
     def __init__(self, files: Sequence[str], board: "Board", progress: Any):
@@ -152,27 +151,25 @@ class _Seen:
         self.without: list[str] = []
         self.corners: Any = []
         self.widths: list[float] = []
-        brightest = None
+        brightest = read_stored(files[0], 1)
         for name in files:
             image = read_stored(name, 1)
-            brightest = image if brightest is None else brightest
             if brightest.shape != image.shape:
                 (one, other) = (f"{a.shape[1]}×{a.shape[0]}" for a in (brightest, image))
                 raise ValueError(
                     f"all pictures must have one size: {files[0]} has {one} (W×H) px, {name} has "
                     f"{other}"
                 )
-            brightest = np.maximum(brightest, image)
             corners = find_corners(image, board)
             if np.isfinite(corners).any():
+                brightest = np.maximum(brightest, image) if self.names else image
                 self.names.append(name)
                 self.corners.append(corners)
                 self.widths.append(edge_width(image, corners, board))
             else:
                 self.without.append(name)
             progress.done += 1
-        self.brightest: np.ndarray = brightest
-        self.size: tuple[int, int] = brightest.shape[:2]
+        self.brightest, self.size = brightest, (brightest.shape[0], brightest.shape[1])
         self.corners = np.array(self.corners)
 
     def circle(self) -> tuple[float, float, float] | None:
@@ -243,5 +240,5 @@ def _why(seen: _Seen, board: "Board", given: str) -> str:
             sizes.update([tuple(sorted(meta.shape, reverse=True))] if there else [])
         if sizes and (size := max(sizes, key=lambda size: (sizes[size], size))) > (3, 3):
             return f"{said} of --board {given}: they show {size[0]}x{size[1]} inner corners"
-    none = f", not {', '.join(seen.without)}" if seen.names else ""
+    none = f", not {', '.join(seen.without)}" if seen.names and seen.without else ""
     return f"{said}{none}: {LEAST} are needed, and 10 to 20 are better"

@@ -7,6 +7,7 @@ import torch
 import darswin.lens
 from darswin.cli.arguments import check_out
 from darswin.cli.calibrate import Format, calibrate, write_lens
+from darswin.cli.estimate import estimate
 from darswin.cli.undistort import undistort
 from darswin.cli.views import Look, Up, View
 from darswin.lens.base import Lens
@@ -244,5 +245,5 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
 
 COMMANDS = {
     "show": show, "info": info, "convert": convert, "crop": crop, "calibrate": calibrate,
-    "undistort": undistort,
+    "estimate": estimate, "undistort": undistort,
 }  # fmt: skip

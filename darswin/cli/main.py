@@ -60,7 +60,7 @@ COMMANDS = {
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
-        "makes, draws, describes, converts or crops a calibration, or undistorts pictures and videos",
+        "makes, draws, describes, converts or crops a calibration, or undistorts pictures",
         PICTURES,
         "darswin.cli.lens:COMMANDS",
     ),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastPatchEmbed, FastStage
-from darswin.deploy.own import OwnLinear, OwnNorm
+from darswin.deploy.own import OwnLinear, OwnNorm, pack
 from darswin.deploy.packed import InDtype, OwnBlocks, refuse_gradients
 from darswin.deploy.program import AND_GELU, NOTHING, RUN, Program, Slot, Weights
 from darswin.models.base import Model
@@ -62,6 +62,7 @@ class _UnetRun:
         self.shared = Weights()
         program = Program(self.shared)
         seen = program.input(*_seen(unet))
+        self.places = _place_layers(unet)
         tables, places = _tables(program, unet), _places(program, unet)
         x = carried(program, unet, seen, tables, places)
         if unet.view.in_pixels:
@@ -88,7 +89,7 @@ class _UnetRun:
         refuse_gradients(x)
         unet, view = self.unet, self.unet.view
         rays = [] if prepared.rays is None else [prepared.rays.float()]
-        inputs = [x.float(), *chain(*prepared.tables), *_place_maps(unet, prepared)]
+        inputs = [x.float(), *chain(*prepared.tables), *_place_maps(self.places, prepared)]
         if view.in_pixels:
             (logits,) = RUN([*inputs, *rays], self.weights, self.words)
             return unet.head.finish(view.back(logits.permute(0, 3, 1, 2), prepared))
@@ -138,7 +139,7 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
         results = _results(program, model, seen, tables)
     else:
         places = _places(program, model)
-        constants += _place_maps(model, prepared)
+        constants += _place_maps(_place_layers(model), prepared)
         if prepared.rays is not None:
             constants.append(prepared.rays)
         of_rays = prepared.size if reads_frame else seen.shape[1:]
@@ -238,10 +239,15 @@ def _places(program: Program, unet: Unet) -> list[Slot]:
     return [program.input(*size, width) for size, width in sizes]
 
 
-def _place_maps(unet: Unet, prepared: Prepared) -> list[Tensor]:
+def _place_layers(unet: Unet) -> list[OwnLinear]:
     layers: list[Any] = list(unet.places)
+    return [OwnLinear(pack(layer.weight, layer.bias), layer.out_features) for layer in layers]
+
+
+def _place_maps(layers: Sequence[OwnLinear], prepared: Prepared) -> list[Tensor]:
+    """The inputs of `_places`. No layer of torch computes them: see `TorchThreads` in csrc."""
     steps = zip(layers, prepared.tokens, strict=bool(layers))
-    return [layer(place.to(layer.weight)) for layer, place in steps]
+    return [layer(place.float()) for layer, place in steps]
 
 
 def own(layer: Any, kind: type) -> Any:

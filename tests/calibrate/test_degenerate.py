@@ -56,7 +56,7 @@ ERRORS = {
     "unknown model": (CORNERS, BOARD, {"model": "Kannala"}, "`model`: unknown lens model"),
     "names": (CORNERS, BOARD, {"names": ["a"]}, "`names` must be 6 names"),
     "terms": (CORNERS, BOARD, {"terms": 0}, "`terms` must be 1 to 64"),
-    "one place": (CORNERS * 0 + 300, BOARD, {}, "The pictures do not determine the lens"),
+    "one place": (CORNERS * 0 + 300, BOARD, {}, "At least 3 pictures .* got 0"),
     "narrow model": (rig(true_lens("KannalaBrandt", 220), 6).corners, BOARD,
                      {"model": "Orthographic"}, "Orthographic lens ends at 90°"),
 }  # fmt: skip

@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import side_of
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin import create_model, frames, list_models, optimize
 from darswin.deploy.export import export_onnx
@@ -55,7 +56,7 @@ def assert_same(found, expected, tolerance):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("case", map(cost, CASES))
+@pytest.mark.parametrize("case", list(map(cost, CASES)))
 def test_it_does_not_matter_who_samples_the_frame(case):
     model, frame, lens = made(case)
     size = tuple(frame.shape[1:3])
@@ -72,6 +73,38 @@ def test_it_does_not_matter_who_samples_the_frame(case):
         fast = optimize(model)
         assert_same(fast(frame, lens), result, 1e-4)
         assert_same(fast.run_sampled(sampled, fast.prepare(lens, size), frame), result, 1e-4)
+
+
+class Computations(TorchDispatchMode):
+    """Names the operators of torch that make new numbers."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def __torch_dispatch__(self, operator, types, arguments=(), keywords=None):
+        result = operator(*arguments, **(keywords or {}))
+        tensors = [x for x in arguments if isinstance(x, torch.Tensor)]
+        if operator.namespace != "darswin" and isinstance(result, torch.Tensor):
+            places = [x.untyped_storage().data_ptr() for x in tensors]
+            if result.untyped_storage().data_ptr() not in places:
+                self.names.append(str(operator))
+        return result
+
+
+@pytest.mark.parametrize(
+    "case", list(map(cost, (case for case in CASES if case.startswith("darswin"))))
+)
+def test_an_optimized_model_leaves_the_threads_of_torch_asleep(case):
+    # They stay awake for milliseconds after each operator, and would compete with our threads.
+    model, frame, lens = made(case)
+    images = (frame.permute(0, 3, 1, 2) / 255.0).contiguous()
+    fast = optimize(model, lens=lens)
+    with torch.inference_mode():
+        fast(images)  # prepares the lens
+        with Computations() as computed:
+            fast(images)
+    assert computed.names == []
 
 
 @pytest.mark.slow

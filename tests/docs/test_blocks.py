@@ -84,7 +84,7 @@ def granted(tmp_path_factory):
     """A folder with what pages take for granted: a checkout's examples, photos, scenes, weights."""
     folder = tmp_path_factory.mktemp("granted") / "folder"
     folder.mkdir()
-    for name in ("examples", "darswin"):
+    for name in ("examples", "darswin", "studies"):
         (folder / name).symlink_to(ROOT / name)
     random = np.random.default_rng(0)
     for name in ("cat", "dog"):
@@ -218,6 +218,11 @@ def write_rooms(arguments: list[str], monkeypatch) -> None:
     runpy.run_path(arguments[0], run_name="__main__")
 
 
+def render_boards(arguments: list[str], monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", arguments)
+    runpy.run_path(arguments[0], run_name="__main__")
+
+
 def classify_video(arguments: list[str], monkeypatch) -> None:
     """Runs the program with a video of the camera, and the files that the page wrote."""
     write_video(Path(arguments[1]), count=3, size=(966, 1280))
@@ -228,7 +233,8 @@ def classify_video(arguments: list[str], monkeypatch) -> None:
 def run_program(arguments: list[str], monkeypatch) -> None:
     studies = dict.fromkeys(("studies/study.py", "studies/dense.py"), check_study)
     known = studies | {
-        "examples/camera.py": classify_video, "examples/rooms.py": write_rooms
+        "examples/camera.py": classify_video, "examples/rooms.py": write_rooms,
+        "studies/calibrate_boards.py": render_boards,
     }  # fmt: skip
     known[arguments[0]](arguments, monkeypatch)
 

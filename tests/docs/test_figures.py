@@ -11,11 +11,14 @@ import pytest
 from figures import on_a_phone
 from matplotlib.figure import Figure
 from PIL import Image
+from rigs import rig, true_lens
 
 from darswin import PolarView, create_model
+from darswin.calibrate import calibrate
 from darswin.lens import Equidistant
 from darswin.views import make_view
 from darswin.viz import plot
+from darswin.viz.calibration import draw_calibration
 from darswin.viz.pixels import draw_predictions
 
 ROOT = Path(__file__).parents[2]
@@ -55,6 +58,12 @@ def draw_lens() -> Figure:
     return plot.draw_lens(PICTURE, WIDE, sampler, make_view("tangent", (60, 80), fov=1.9), "a view")
 
 
+def draw_calibrated() -> Figure:
+    made = rig(true_lens("KannalaBrandt", 190, LABELS.shape), 8, noise=0.05)
+    found = calibrate(made.corners, made.board, made.size)
+    return draw_calibration(found, made.corners.numpy(), found.lens)
+
+
 def draw_demo() -> Figure:
     sampler = create_model("darswin_a_nano", spacing="tan").view
     accuracy = record("docs/accuracy.json")["accuracy"]
@@ -78,6 +87,7 @@ def draw_detections(path: Path) -> None:
 
 
 RETURNED: dict[str, Callable[[], Figure]] = {
+    "calibration": draw_calibrated,
     "demo": draw_demo,
     "labels": lambda: draw_predictions(
         [(PICTURE, LABELS, LABELS)], [f"class {k}" for k in "abcdef"]

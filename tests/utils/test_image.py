@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
-from darswin.utils.image import BrokenImageError, read_header, read_image, read_oriented
+from darswin.utils.image import (
+    BrokenImageError,
+    read_header,
+    read_image,
+    read_oriented,
+    read_stored,
+)
 
 
 def chunk(kind, data):
@@ -27,7 +33,7 @@ HUGE += chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
         (HUGE, "too many pixels"),
     ],
 )
-@pytest.mark.parametrize("read", [read_image, read_oriented])
+@pytest.mark.parametrize("read", [read_image, read_oriented, read_stored])
 def test_a_broken_picture_is_named(tmp_path, content, message, read):
     if content is not None:
         (tmp_path / "x.png").write_bytes(content)
@@ -50,6 +56,9 @@ def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
         image, found = read_oriented(path, channels)
         assert found == orientation and image.flags.c_contiguous
         assert np.array_equal(image, read_image(path, channels))
+        stored = read_stored(path, channels)
+        assert stored.shape == (32, 48, channels) and stored.flags.c_contiguous
+        assert np.abs(stored.astype(int) - pixels[..., None]).max() < 6
         header = read_header(path)
         assert header.orientation == orientation and header.upright == image.shape[:2]
         assert header.size == (32, 48) and header.channels == 3 and header.is_sound

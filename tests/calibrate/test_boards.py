@@ -1,0 +1,289 @@
+"""Boards and their corners, in rendered pictures through several lenses."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from calibrate_boards import Pose, Renderer
+
+from darswin.calibrate import Board, find_corners
+from darswin.calibrate.boards import edge_width, image_circle, wrong
+from darswin.lens import Equidistant, Lens, Perspective
+
+CHESSBOARD = Board.chessboard(9, 6, 0.025)
+BOARDS = {
+    "chessboard": CHESSBOARD,
+    "charuco": Board.charuco(7, 5, 0.03, 0.022),
+    "april": Board.april_grid(4, 3, 0.03, 0.009),
+}
+
+
+def camera(fov: float, size: tuple[int, int] = (480, 480), **look) -> Renderer:
+    half = math.radians(fov / 2)
+    radius = min(size) / 2 - 4
+    lens: Lens = Equidistant(radius / half, half, image_size=size)
+    if fov <= 90:
+        # The sides of the picture are fov wide, and its corners wider.
+        reach = math.atan(math.sqrt(2) * math.tan(half))
+        lens = Perspective(min(size) / 2 / math.tan(half), reach, image_size=size)
+    return Renderer(lens, samples=2, **look)
+
+
+def errors(found: np.ndarray, true: np.ndarray, kind: str) -> np.ndarray:
+    """px, of the corners that were found. A chessboard looks the same from its other end."""
+    ways = (found, found[::-1]) if kind == "chessboard" else (found,)
+    every = [np.linalg.norm(way - true, axis=1) for way in ways]
+    best = min(every, key=np.nanmedian)
+    return best[np.isfinite(best)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "fov", "usual", "share"),
+    [
+        ("chessboard", 60, 0.12, 1.0),
+        ("chessboard", 150, 0.12, 1.0),
+        ("chessboard", 200, 0.12, 1.0),
+        ("chessboard", 220, 0.12, 1.0),
+        ("charuco", 90, 0.2, 0.75),
+        ("charuco", 200, 0.2, 0.7),
+        ("april", 90, 0.3, 0.9),
+        ("april", 220, 0.3, 0.9),
+    ],
+)
+def test_corners_are_found_where_they_are(kind, fov, usual, share):
+    view, board, rng = camera(fov), BOARDS[kind], np.random.default_rng(1)
+    count, off = 0, []
+    for pose in view.poses(board, 3, rng):
+        found, true = find_corners(view.picture(board, pose, rng), board), view.corners(board, pose)
+        assert found.shape == true.shape and found.dtype == np.float64
+        off.append(errors(found, true, kind))
+        count += len(off[-1])
+    assert count >= share * 3 * len(board.points)
+    assert np.median(np.concatenate(off)) < usual
+
+
+@pytest.mark.parametrize("kind", ["charuco", "april"])
+def test_a_board_seen_in_part_keeps_its_numbers(kind):
+    view, board, rng = camera(120, (360, 360)), BOARDS[kind], np.random.default_rng(3)
+    found_some = 0
+    for pose in view.poses(board, 3, rng):
+        picture = view.picture(board, pose, rng)
+        true = view.corners(board, pose)
+        # A hand lies on a half of the board.
+        middle = np.nanmedian(true[:, 0])
+        picture[:, int(middle) :] = 90
+        found = find_corners(picture, board)
+        assert np.isnan(found[true[:, 0] > middle + 3]).all()
+        if (seen := np.isfinite(found[:, 0])).any():
+            assert np.median(np.linalg.norm(found - true, axis=1)[seen]) < 0.4
+            found_some += 1
+    assert found_some >= 2
+
+
+def kalibr_picture(upside_down: bool) -> tuple[np.ndarray, Board, np.ndarray]:
+    """A grid as Kalibr draws it: a border of two bits, and tag 0 at the lower left."""
+    tag, gap, columns, rows = 60, 18, 4, 3
+    board = Board.april_grid(columns, rows, float(tag), float(gap))
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    picture = np.full((rows * 78 + 60, columns * 78 + 60), 230, np.uint8)
+    for row in range(rows):
+        for column in range(columns):
+            number = (rows - 1 - row) * columns + column
+            drawn = cv2.aruco.generateImageMarker(markers, number, tag, borderBits=2)
+            y, x = 30 + row * 78, 30 + column * 78
+            picture[y : y + tag, x : x + tag] = drawn
+    true = board.points + 29.5
+    if upside_down:
+        picture = np.ascontiguousarray(picture[::-1, ::-1])
+        true = np.array(picture.shape[::-1]) - 1 - true
+    return cv2.GaussianBlur(picture, (0, 0), 0.7), board, true
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_grids_of_kalibr_are_read(upside_down):
+    picture, board, true = kalibr_picture(upside_down)
+    np.testing.assert_allclose(find_corners(picture, board), true, atol=0.5)
+
+
+@pytest.fixture(scope="module")
+def one() -> tuple[Renderer, Pose, np.ndarray]:
+    view, rng = camera(150, (360, 360)), np.random.default_rng(1)
+    (pose,) = view.poses(CHESSBOARD, 1, rng)
+    return view, pose, view.picture(CHESSBOARD, pose, rng)
+
+
+def test_pictures_may_be_grey_coloured_or_turned_and_the_board_never_mirrored(one):
+    *_, picture = one
+    first = find_corners(picture, CHESSBOARD)
+    for same in (picture[..., None], np.repeat(picture[..., None], 3, 2)):
+        np.testing.assert_allclose(find_corners(same, CHESSBOARD), first, atol=1e-6)
+    for turned in (np.rot90(picture), picture[::-1, ::-1], picture[:, ::-1], picture.T):
+        grid = find_corners(np.ascontiguousarray(turned), CHESSBOARD).reshape(6, 9, 2)
+        across, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
+        assert (across[..., 0] * down[..., 1] > across[..., 1] * down[..., 0]).all()
+
+
+@pytest.mark.parametrize("kind", ["charuco", "april"])
+def test_markers_are_not_found_in_a_mirrored_picture(kind):
+    view, rng = camera(120, (360, 360)), np.random.default_rng(1)
+    (pose,) = view.poses(BOARDS[kind], 1, rng)
+    picture = view.picture(BOARDS[kind], pose, rng)
+    assert np.isfinite(find_corners(picture, BOARDS[kind])).sum() > 20
+    assert np.isnan(find_corners(picture[:, ::-1], BOARDS[kind])).all()
+
+
+def covered(picture, corners):
+    x, y = corners[20].astype(int)
+    picture[y - 20 : y + 20, x - 20 : x + 20] = 128
+
+
+def cut(picture, corners):
+    picture[:, int(np.median(corners[:, 0])) :] = 0
+
+
+def no_board(picture, corners):
+    picture[:] = np.linspace(0, 255, picture.shape[1]).astype(np.uint8)
+
+
+def blurred(picture, corners):
+    picture[:] = cv2.GaussianBlur(picture, (0, 0), 12)
+
+
+@pytest.mark.parametrize("damage", [covered, cut, no_board, blurred])
+def test_a_chessboard_that_is_not_whole_is_not_found(one, damage):
+    view, pose, picture = one
+    picture = picture.copy()
+    damage(picture, view.corners(CHESSBOARD, pose))
+    assert np.isnan(find_corners(picture, CHESSBOARD)).all()
+
+
+def test_another_board_is_not_taken_for_the_board(one):
+    assert np.isnan(find_corners(one[2], Board.chessboard(8, 7, 0.025))).all()
+
+
+def mirrored(grid):
+    return grid[:, ::-1]
+
+
+def exchanged(grid):
+    grid[2, 3], grid[2, 4] = grid[2, 4].copy(), grid[2, 3].copy()
+    return grid
+
+
+def off(grid):
+    grid[3, 3] += 0.6 * (grid[3, 4] - grid[3, 3])
+    return grid
+
+
+def skipped(grid):
+    grid[:, 5:] += grid[:, 5:6] - grid[:, 4:5]
+    return grid
+
+
+@pytest.mark.parametrize("change", [mirrored, exchanged, off, skipped])
+def test_a_wrong_order_is_noticed(one, change):
+    view, pose, _ = one
+    grid = view.corners(CHESSBOARD, pose).reshape(6, 9, 2)
+    assert not wrong(grid, CHESSBOARD).any()
+    odd = wrong(change(grid.copy()), CHESSBOARD)
+    assert odd.any()
+    if change is off:
+        assert np.unravel_index(odd.argmax(), odd.shape) == (3, 3)
+
+
+@pytest.mark.parametrize("fov", [60, 150, 250])
+def test_true_corners_are_never_wrong(fov):
+    view = camera(fov)
+    for name, board in BOARDS.items():
+        for pose in view.poses(board, 12, np.random.default_rng(2)):
+            grid = view.corners(board, pose).reshape(board.rows, board.columns, 2)
+            assert not wrong(grid, board).any(), name
+
+
+def test_points_are_in_the_unit_of_the_square():
+    expected = [[0, 0], [2, 0], [4, 0], [0, 2], [2, 2], [4, 2]]
+    np.testing.assert_array_equal(Board.chessboard(3, 2, 2.0).points, expected)
+    np.testing.assert_array_equal(Board.charuco(4, 3, 2.0, 1.0).points, expected)
+    grid = Board.april_grid(2, 1, 2.0, 0.5).points
+    x = [0, 2, 2.5, 4.5]
+    np.testing.assert_array_equal(grid, [[a, b] for b in (0, 2) for a in x])
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "said"),
+    [
+        (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 2 to 100, got 1"),
+        (lambda: Board.chessboard(9, 6.0, 0.1), TypeError, "`rows` must be a whole number"),
+        (lambda: Board.chessboard(9, 6, 0.0), ValueError, "`square` must be positive, got 0"),
+        (lambda: Board.chessboard(9, 6, math.nan), ValueError, "`square` must be positive"),
+        (lambda: Board.charuco(9, 6, 0.1, 0.1), ValueError, "`marker` must be below the square"),
+        (lambda: Board.charuco(9, 6, 0.1, 0.05, "4X4_5"), ValueError, "did you mean 4X4_50"),
+        (lambda: Board.charuco(20, 20, 0.1, 0.05, "4X4_50"), ValueError, "200 markers or more"),
+        (lambda: Board.april_grid(6, 6, 0.1, 0.0), ValueError, "`gap` must be positive"),
+        (lambda: find_corners(np.zeros((9, 9)), CHESSBOARD), TypeError, "array of uint8"),
+        (lambda: find_corners([1], CHESSBOARD), TypeError, "array of uint8"),
+        (
+            lambda: find_corners(np.zeros((9, 9, 4), np.uint8), CHESSBOARD),
+            ValueError,
+            r"\(H, W, 3\), got \(9, 9, 4\)",
+        ),
+    ],
+)
+def test_wrong_arguments(make, error, said):
+    with pytest.raises(error, match=said):
+        make()
+
+
+@pytest.mark.parametrize("size", [(480, 480), (400, 640), (640, 400), (480, 500)])
+def test_the_image_circle_is_that_of_the_lens(size):
+    half, rng = math.radians(100), np.random.default_rng(0)
+    x, y = size[1] / 2 + 6.0, size[0] / 2 - 4.0
+    lens = Equidistant(205 / half, half, center=(x, y), image_size=size)
+    view = Renderer(lens, samples=2)
+    pictures = [view.picture(CHESSBOARD, p, rng) for p in view.poses(CHESSBOARD, 3, rng)]
+    np.testing.assert_allclose(image_circle(pictures), (x, y, 205), atol=1.5)
+    # A board at the rim of a dark picture does not move it.
+    dark = [(picture * 0.3).astype(np.uint8) for picture in pictures]
+    np.testing.assert_allclose(image_circle(dark), (x, y, 205), atol=2.5)
+
+
+def test_pictures_without_a_circle_have_none(one):
+    view, rng = camera(80), np.random.default_rng(0)
+    (pose,) = view.poses(CHESSBOARD, 1, rng)
+    assert image_circle([view.picture(CHESSBOARD, pose, rng)]) is None
+    framed = np.zeros((300, 400), np.uint8)
+    assert image_circle([framed]) is None
+    framed[40:-40, 40:-40] = 120
+    assert image_circle([framed]) is None
+
+
+def test_edges_are_as_wide_as_their_blur():
+    widths = []
+    for blur in (0.5, 1.0, 2.0):
+        view, rng = camera(90, blur=blur, noise=0.5), np.random.default_rng(4)
+        (pose,) = view.poses(CHESSBOARD, 1, rng)
+        picture = view.picture(CHESSBOARD, pose, rng)
+        widths.append(edge_width(picture, view.corners(CHESSBOARD, pose), CHESSBOARD))
+    assert 1.4 < widths[0] < 2.2 and 2.3 < widths[1] < 3.3 and widths[2] > 3.8
+
+
+def test_the_renderer_follows_rays_behind_the_camera():
+    """A board at 105° from the axis is seen, from its front only, and the mean of a square is its
+    own light."""
+    view, rng = camera(240, noise=0.0, vignette=0.0, blur=0.0), np.random.default_rng(0)
+    angle = math.radians(105)
+    ray = np.array([math.sin(angle), 0.0, math.cos(angle)])
+    facing = np.stack((np.cross([0.0, 1.0, 0.0], ray), [0.0, 1.0, 0.0], ray), 1)
+    middle = CHESSBOARD.points.mean(0)
+    pose = Pose(facing, 0.4 * ray - facing[:, :2] @ middle)
+    picture, corners = view.picture(CHESSBOARD, pose, rng), view.corners(CHESSBOARD, pose)
+    theta = view.lens.unproject_pixels(torch.from_numpy(corners)[None])[0]
+    assert theta.min() > math.radians(85) and theta.max() > math.radians(115)
+    cells = corners.reshape(6, 9, 2)
+    x, y = ((cells[1:, 1:] + cells[:-1, :-1]) / 2).round().astype(int).reshape(-1, 2).T
+    assert set(np.unique(picture[y, x])) == {15, 230}
+    back = Pose(facing @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
+    assert not np.isin(picture, [15, 230]).all()
+    assert not np.isin(view.picture(CHESSBOARD, back, rng), [15, 230]).any()

@@ -1,0 +1,156 @@
+"""Lenses from straight curves: simulated lines through known lenses, and drawn rooms."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from darswin import lens as lenses
+from darswin.calibrate import CalibrationError, estimate
+from darswin.calibrate.lines import from_curves
+
+SIZE = (480, 640)
+F64 = {"image_size": SIZE}
+
+
+def f64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+LENSES = {
+    "spherical 0.3": lenses.Spherical(f64(0.3), f64(300.0), **F64),
+    "spherical 0.8": lenses.Spherical(f64(0.8), f64(300.0), **F64),
+    "kannala 150": lenses.KannalaBrandt(f64(255.0), f64(-0.02, -0.005)[None], **F64),
+    "kannala 200": lenses.KannalaBrandt(f64(140.0), f64(0.01, -0.006)[None], **F64),
+    "equidistant": lenses.Equidistant(f64(200.0), **F64),
+    "equisolid": lenses.Equisolid(f64(180.0), **F64),
+    "stereographic": lenses.Stereographic(f64(190.0), **F64),
+    "division": lenses.OCam(f64(-260.0, 0.0, 1.6e-3), **F64),
+    "field of view": lenses.FieldOfView(f64(1.0), f64(280.0), **F64),
+    "perspective": lenses.Perspective(f64(400.0), **F64),
+}
+
+
+def curves_of(lens, seed, lines=30, *, noise=0.15, askew=6, bent=6, axes=3, center=(0.0, 0.0)):
+    """Curves of a camera in a world of lines along `axes` orthogonal directions, with lines askew
+    and curves that are not straight."""
+    rng = np.random.default_rng(seed)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    curves = []
+    while len(curves) < lines + askew + bent:
+        k = len(curves)
+        way = rotation[k % axes] if k < lines else rng.normal(size=3)
+        way = way / np.linalg.norm(way)
+        along = np.linspace(-6, 6, 3000)[:, None] * way
+        if k >= lines + askew:  # an arc of a circle
+            turn = np.linspace(0, 1.5, 3000)[:, None]
+            side = np.cross(way, rng.normal(size=3))
+            along = 1.5 * (np.cos(turn) * way + np.sin(turn) * side / np.linalg.norm(side))
+        points = torch.from_numpy(rng.normal(size=3) * 2 + along)
+        pixels = lens.project_points(points[None])[0].numpy()
+        seen = ((pixels > -0.5) & (pixels < np.array(SIZE[::-1]) - 0.5)).all(1)
+        last = np.nonzero(~seen)[0]
+        pixels = pixels[seen] if not len(last) else max(np.split(pixels, last), key=len)[1:]
+        if len(pixels) < 2:
+            continue
+        steps = np.r_[0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
+        count = int(min(steps[-1], rng.uniform(80, 300)))
+        if count < 60:
+            continue
+        places = np.arange(count)
+        even = np.stack([np.interp(places, steps, pixels[:, j]) for j in (0, 1)], 1)
+        curves.append(even + rng.normal(0, noise, even.shape) + center)
+    return sorted(curves, key=len, reverse=True)
+
+
+def rim_of(lens, radius=240.0):
+    return lens.with_theta_max(None).unproject(radius).item()
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [(name, "Spherical") for name in LENSES]
+    + [(name, "KannalaBrandt") for name in LENSES if name.startswith("kannala")],
+)
+def test_a_lens_is_found_from_lines_in_three_directions(name, model):
+    curves = [curves_of(LENSES[name], seed) for seed in (1, 2)]
+    found = from_curves(curves, SIZE, model)
+    assert type(found.lens).__name__ == model and found.lens.theta_max.dtype == torch.float64
+    assert found.rim == pytest.approx(rim_of(LENSES[name]), rel=0.03)
+    assert found.interval[0] <= found.rim <= found.interval[1] < 1.2 * found.rim
+    assert 40 <= found.curves <= 80 and 0.8 < found.covered <= 1
+
+
+@pytest.mark.parametrize("model", ["Division", "OCam"])
+def test_the_division_model_is_an_ocam_lens(model):
+    curves = [curves_of(LENSES["division"], seed) for seed in (1, 2)]
+    found = from_curves(curves, SIZE, model)
+    assert found.lens.coefficients.shape == (1, 3) and found.lens.coefficients[0, 1] == 0
+    assert found.rim == pytest.approx(rim_of(LENSES["division"]), rel=0.02)
+    said = found.to_dict()
+    assert json.loads(json.dumps(said))["lens"] == lenses.to_dict(found.lens)
+    assert f"{math.degrees(found.rim):.1f}° at the rim" in said["verdict"]
+
+
+def test_straightness_alone_does_not_tell_the_focal_length():
+    """Lines of one direction: a lens is refused, unless the field of view is known."""
+    lens = LENSES["stereographic"]
+    curves = [curves_of(lens, seed, axes=1, askew=0) for seed in (1, 2, 3)]
+    with pytest.raises(CalibrationError, match="do not tell the focal length"):
+        from_curves(curves, SIZE)
+    circle = (319.5, 239.5, 240.0)
+    found = from_curves(curves, SIZE, circle=circle, fov=2 * rim_of(lens))
+    assert found.rim == pytest.approx(rim_of(lens), rel=2e-3)
+    at = np.linspace(20, 220, 11)
+    theta = found.lens.unproject(torch.from_numpy(at)[None]), lens.unproject(torch.from_numpy(at))
+    torch.testing.assert_close(theta[0][0], theta[1], rtol=0.02, atol=0)
+    assert "the given field of view" in found.verdict
+
+
+def test_a_factor_of_the_tangent_keeps_lines_straight():
+    """The theory that the module states: planes of rays stay planes."""
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(20, 2)) @ rng.normal(size=(2, 3))
+    assert np.linalg.matrix_rank(rays * (1, 1, 1.7)) == 2
+
+
+def test_the_centre_is_found_if_there_are_many_curves():
+    lens = LENSES["equidistant"]
+    curves = [curves_of(lens, s, 80, bent=0, askew=0, center=(6.0, -4.0)) for s in range(4)]
+    found = from_curves(curves, SIZE, "Equidistant")
+    torch.testing.assert_close(found.lens.center[0], f64(325.5, 235.5), atol=1.0, rtol=0)
+    fixed = from_curves(curves[:2], SIZE, "Equidistant", center=(325.5, 235.5))
+    torch.testing.assert_close(fixed.lens.center[0], f64(325.5, 235.5), atol=0.1, rtol=0)
+
+
+def test_too_little_evidence_is_refused_in_one_sentence():
+    for curves in ([], [[]], [curves_of(LENSES["equidistant"], 1, 5, askew=0, bent=2)]):
+        with pytest.raises(CalibrationError, match="curves may be straight lines, but") as error:
+            from_curves(curves, SIZE)
+        assert "\n" not in str(error.value)
+
+
+def test_an_estimate_is_the_same_bits_again():
+    curves = [curves_of(LENSES["equisolid"], 1)]
+    one, two = (from_curves(curves, SIZE).to_dict() for _ in range(2))
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"pictures": []}, "one size .* got no pictures"),
+        ({"pictures": [np.zeros((20, 30), np.uint8), np.zeros((30, 20), np.uint8)]},
+         "got 30 × 20, 20 × 30"),
+        ({"model": "Sphere"}, "unknown lens model 'Sphere'"),
+        ({"fov": 7.0}, "`fov` must be above 0 and below 2π, got 7"),
+        ({"fov": 2.0}, "no image circle is visible"),
+        ({}, "only 0 curves may be straight lines"),
+    ],
+)  # fmt: skip
+def test_wrong_arguments(arguments, message):
+    given = {"pictures": [np.full((60, 80, 3), 90, np.uint8)]} | arguments
+    with pytest.raises(ValueError, match=message):
+        estimate(**given)

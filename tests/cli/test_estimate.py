@@ -1,0 +1,91 @@
+"""`darswin lens estimate` on drawn rooms."""
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from darswin import lens as lenses
+from darswin.cli.main import main
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+from rooms import Room
+
+SIZE = (400, 480)
+
+
+def draw_rooms(lens, folder: Path, count: int) -> None:
+    """Pictures of rooms through a lens, with nine rays in each pixel."""
+    side = torch.tensor([-1 / 3, 0, 1 / 3], dtype=torch.float64)
+    y, x = torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="ij")
+    rays = [lens.unproject_points(torch.stack((x + dx, y + dy), -1)[None])[0].numpy()
+            for dx in side for dy in side]  # fmt: skip
+    for k in range(count):
+        room = Room(np.random.default_rng(k))
+        colors = np.mean([room.colors(r.astype(np.float32)) for r in rays], 0)
+        cv2.imwrite(f"{folder}/{k}.png", colors.astype(np.uint8)[..., ::-1])
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rooms")
+    focal = torch.tensor([160.0], dtype=torch.float64)
+    lens = lenses.Stereographic(focal, image_size=SIZE)
+    draw_rooms(lens, folder, 2)
+    return folder, lens.unproject(200.0).item()
+
+
+def test_a_lens_is_estimated_and_written(rooms, tmp_path, capsys):
+    folder, rim = rooms
+    out, report = tmp_path / "camera.json", tmp_path / "report.json"
+    main(["lens", "estimate", str(folder), "--out", str(out), "--report", str(report)])
+    said, progress = capsys.readouterr()
+    assert "straight curves over" in said and f"{out}: darswin, Spherical up to" in said
+    assert "picture 2 of 2: " in progress
+    found = lenses.load(out)
+    assert found.unproject(200.0).item() == pytest.approx(rim, rel=0.01)
+    content = json.loads(report.read_text())
+    assert content["rim"] == pytest.approx(rim, rel=0.01) and len(content["pictures"]) == 2
+    assert content["lens"]["model"] == "Spherical" and content["interval"][0] <= content["rim"]
+
+
+def test_pictures_turned_by_exif_give_the_lens_of_stored_pictures(rooms, tmp_path):
+    from PIL import Image
+
+    folder, rim = rooms
+    image = Image.open(folder / "0.png")
+    exif = image.getexif()
+    exif[274] = 6
+    image.save(tmp_path / "turned.jpg", exif=exif, quality=97)
+    out = tmp_path / "camera.json"
+    main(["lens", "estimate", str(tmp_path / "turned.jpg"), "--out", str(out)])
+    found = lenses.load(out)
+    assert found.image_size.tolist() == [list(SIZE)]
+    assert found.unproject(200.0).item() == pytest.approx(rim, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "missing pictures"),
+        (["nothing.png"], "there is no file or folder nothing.png"),
+        (["ROOMS", "--fov_deg", "400"], "--fov_deg must be above 0° and below 360°, got 400"),
+        (["ROOMS", "--fov_deg", "180"], "no image circle is visible"),
+        (["ROOMS", "--model", "Sphericl"], "unknown lens model 'Sphericl'"),
+        (["ROOMS/0.png", "--out", "ROOMS/0.png"], "0.png"),
+        (["EVEN"], "only 0 curves may be straight lines, but an estimate needs 10"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_sentence(rooms, tmp_path, arguments, message, capsys):
+    cv2.imwrite(str(tmp_path / "even.png"), np.full((90, 120, 3), 80, np.uint8))
+    places = {"ROOMS": str(rooms[0]), "EVEN": str(tmp_path / "even.png")}
+    for name, place in places.items():
+        arguments = [argument.replace(name, place) for argument in arguments]
+    with pytest.raises(SystemExit) as error:
+        main(["lens", "estimate", *arguments])
+    said = f"{error.value} {capsys.readouterr().err}"
+    assert message in said and "Traceback" not in said
