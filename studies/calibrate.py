@@ -67,7 +67,9 @@ def run_cell(file: Path, work: str, *arguments: object) -> dict:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="runs three sets")
+    parser.add_argument(
+        "--quick", action="store_true", help="runs three sets, and leaves the record alone"
+    )
     parser.add_argument("--cell", default="", help="runs only cells whose key contains this text")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument(
@@ -77,6 +79,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out") / "calibrate")
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results")
     args = parser.parse_args(arguments)
+    if args.quick:
+        args.out = args.results = args.out / "quick"
     tools, jobs = versions(), []
     for seed, which in enumerate(QUICK if args.quick else all_sets()):
         key = key_of(f"{seed:03} {which.model} {which.fov} {which.pictures} {which.noise}")

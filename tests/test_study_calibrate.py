@@ -106,10 +106,10 @@ def test_a_run_is_recorded_and_its_tables_are_made(tmp_path, monkeypatch):
     monkeypatch.setattr(
         calibrate, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs]
     )  # fmt: skip
-    where = ["--results", str(tmp_path), "--data", str(tmp_path / "none"), "--out", str(tmp_path)]
+    where = ["--data", str(tmp_path / "none"), "--out", str(tmp_path)]
     calibrate.main(["--quick", *where])
-    record = json.loads((tmp_path / "calibrate.json").read_text())
-    assert (tmp_path / "calibrate.png").exists()
+    record = json.loads((tmp_path / "quick" / "calibrate.json").read_text())
+    assert (tmp_path / "quick" / "calibrate.png").exists()
     (of,) = record["sets"]
     assert of["results"]["cv2.fisheye, flags"]["failed"] == "FailedError: too few pictures"
     made = calibrate_tables.tables(record)
@@ -121,7 +121,7 @@ def test_a_run_is_recorded_and_its_tables_are_made(tmp_path, monkeypatch):
     # A set that is known is not run again.
     monkeypatch.setattr(calibrate, "run_set", fails)
     calibrate.main(["--quick", "--collect", *where])
-    assert json.loads((tmp_path / "calibrate.json").read_text()) == record
+    assert json.loads((tmp_path / "quick" / "calibrate.json").read_text()) == record
     assert calibrate_tables.tables(None) == dict.fromkeys(made, calibrate_tables.NOT_RUN)
 
 
