@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -139,6 +139,17 @@ study-sizes: build  ## study distances that only the lens and the size of balls 
 study-pretrained: build  ## study detectors for ordinary photographs on fisheye pictures (half an hour; needs npm and apt-get)
 	$(BIN)/python studies/pretrained_files.py
 	$(BIN)/python studies/pretrained.py
+
+# The peer `cv2.omnidir` is in opencv-contrib, which must not be beside our OpenCV.
+CONTRIB := .venv-contrib
+
+$(CONTRIB)/installed:
+	$(PYTHON) -m venv --clear $(CONTRIB)
+	$(CONTRIB)/bin/pip install -q opencv-contrib-python-headless==$$(sed -n "s/^opencv-python-headless==//p" requirements.txt)
+	@touch $@
+
+study-calibrate: build $(CONTRIB)/installed  ## study calibrations from corners of boards (15 minutes; needs `apt-get install mrcal opencv-doc`)
+	$(BIN)/python studies/calibrate.py
 
 study-estimate: build  ## study lenses estimated from lines (6 minutes; needs `apt-get install freedoom opencv-doc`)
 	$(BIN)/python studies/estimate.py

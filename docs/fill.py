@@ -134,6 +134,7 @@ def demo_line(record: dict) -> str:
 
 def tables() -> dict[str, str]:
     """All tables, by the name of their place in a page."""
+    import calibrate_tables
     import dense_tables
     import estimate_tables
     import learned_tables
@@ -160,6 +161,7 @@ def tables() -> dict[str, str]:
     tried = json.loads((studies / "trials.json").read_text())["rows"]
     sizes = json.loads((studies / "sizes.json").read_text())
     pretrained = json.loads((studies / "pretrained.json").read_text())
+    calibrated = json.loads((studies / "calibrate.json").read_text())
     estimated = json.loads((studies / "estimate.json").read_text())
     return {
         "demo": demo_table(demo),
@@ -195,6 +197,7 @@ def tables() -> dict[str, str]:
         **{f"trials {of}": dense_tables.trials(tried, of) for of in dense_tables.TRIED},
         **sizes_tables.tables(sizes),
         **pretrained_tables.tables(pretrained),
+        **calibrate_tables.tables(calibrated),
         **estimate_tables.tables(estimated),
     }
 

@@ -65,7 +65,7 @@ class Board:
 
     @property
     def points(self) -> np.ndarray:
-        """(K, 2) float64: the corners, row by row, x along columns and y along rows."""
+        """(K, 2): the corners, row by row, x along columns and y along rows; in float64."""
         place = np.arange(max(self.columns, self.rows), dtype=np.float64)
         pair, second = np.divmod(place, 2)
         april = pair * (self.square + self.other) + second * self.square

@@ -46,11 +46,11 @@ def test_twenty_pictures_give_every_model(model, fov):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [2, 4])
 @pytest.mark.parametrize(("model", "fov"), ALL)
 def test_eight_pictures_give_every_model(model, fov, seed):
     lens = true_lens(model, fov, seed=seed)
-    points = board(7, 5) if seed == 1 else None
+    points = board(7, 5) if seed == 4 else None
     found = of(rig(lens, 8, points, seed=seed), model)
     assert ray_errors(found.lens, lens, best=True).median() < 0.3
     assert 0.15 < found.sigma < 0.25 and found.used.all()
