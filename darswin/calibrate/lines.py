@@ -29,6 +29,7 @@ BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.12, 4, 40)  # a₁ and 
 AS_GOOD = 1.1  # times the least cost: other answers that the pictures allow
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
 UNSURE, OFF, COVERED = 0.05, 2.0, 0.8  # of the rim's angle; px; of the radius
+NARROWEST = math.radians(3)  # at the rim
 
 
 @dataclass(frozen=True)
@@ -141,9 +142,14 @@ def from_curves(
             break
         except ValueError as reason:
             if part == 0.8:
-                raise CalibrationError(str(reason)) from reason
+                raise CalibrationError(
+                    f"no {model} lens is close to what the lines show: give more pictures, or "
+                    "try another model"
+                ) from reason
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
+    if rim < NARROWEST:
+        raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
     sigma, rims = 0.0 if fov else best.deviation(), [rim, *(f.rim for f in found)]
     low, high = min(rims) - sigma, max(rims) + sigma

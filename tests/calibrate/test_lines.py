@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from darswin import lens as lenses
-from darswin.calibrate import CalibrationError, estimate
+from darswin.calibrate import CalibrationError, estimate, lines
 from darswin.calibrate.lines import from_curves
 
 SIZE = (480, 640)
@@ -33,18 +33,18 @@ LENSES = {
 }
 
 
-def curves_of(lens, seed, lines=30, *, noise=0.15, askew=6, bent=6, axes=3, center=(0.0, 0.0)):
+def curves_of(lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, center=(0.0, 0.0)):
     """Curves of a camera in a world of lines along `axes` orthogonal directions, with lines askew
     and curves that are not straight."""
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     curves = []
-    while len(curves) < lines + askew + bent:
+    while len(curves) < straight + askew + bent:
         k = len(curves)
-        way = rotation[k % axes] if k < lines else rng.normal(size=3)
+        way = rotation[k % axes] if k < straight else rng.normal(size=3)
         way = way / np.linalg.norm(way)
         along = np.linspace(-6, 6, 3000)[:, None] * way
-        if k >= lines + askew:  # an arc of a circle
+        if k >= straight + askew:  # an arc of a circle
             turn = np.linspace(0, 1.5, 3000)[:, None]
             side = np.cross(way, rng.normal(size=3))
             along = 1.5 * (np.cos(turn) * way + np.sin(turn) * side / np.linalg.norm(side))
@@ -130,6 +130,13 @@ def test_too_little_evidence_is_refused_in_one_sentence():
         with pytest.raises(CalibrationError, match="curves may be straight lines, but") as error:
             from_curves(curves, SIZE)
         assert "\n" not in str(error.value)
+
+
+def test_no_lens_at_all_is_no_answer(monkeypatch):
+    curves = [curves_of(LENSES["equisolid"], 1)]
+    monkeypatch.setattr(lines, "NARROWEST", from_curves(curves, SIZE).rim + 0.1)
+    with pytest.raises(CalibrationError, match="do not determine a lens"):
+        from_curves(curves, SIZE)
 
 
 def test_an_estimate_is_the_same_bits_again():
