@@ -21,6 +21,7 @@ from darswin.calibrate.calibration import CalibrationError
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
+from darswin.utils.parameters import check
 
 MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
 STEP = 4  # points of an edge that are averaged
@@ -84,8 +85,8 @@ def estimate(
     """
     if model not in MODELS and model != "Division":
         raise ValueError(unknown_model(model))
-    if fov is not None and not 0 < fov < 2 * math.pi:
-        raise ValueError(f"`fov` must be above 0 and below 2π, got {fov}")
+    if fov is not None:
+        check("fov", fov, 0 < fov < 2 * math.pi, "above 0 and below 2π")
     sizes = {picture.shape[:2] for picture in pictures}
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
