@@ -29,12 +29,12 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
     args.out = static_cast<float*>(out);
   }
   const auto& table = kernels<LinearKernels<X>>();
-  const auto kernel = table.by_fours != nullptr && has_fours() ? table.by_fours : table.rows;
+  const bool by_fours = table.by_fours != nullptr && has_fours();
+  const auto kernel = by_fours ? table.by_fours : table.rows;
   constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
-  // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
-  constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
+  const double per_microsecond = by_fours ? 1e5 : 5e4;  // multiply-adds
   const double work = static_cast<double>(rows) * depth * columns;
-  const Threads threads = threads_for(work / kPerMicrosecond);
+  const Threads threads = threads_for(work / per_microsecond);
   const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
