@@ -30,16 +30,18 @@ from darswin.calibrate.refine import (
 from darswin.lens import MODELS, Lens, to_dict
 from darswin.lens.base import unknown_model
 from darswin.lens.files.load import reach
+from darswin.lens.fitting import slopes_of
 from darswin.utils.parameters import check, naming
 
 # What "auto" tries.
 CANDIDATES = (
-    "Perspective", "Equidistant", "Equisolid", "Stereographic", "FieldOfView", "EnhancedUnified",
-    "KannalaBrandt", "OCam", "BrownConrady", "Mei", "Fisheye624",
+    "KannalaBrandt", "Perspective", "Equidistant", "Equisolid", "Stereographic", "FieldOfView",
+    "EnhancedUnified", "OCam", "BrownConrady", "Mei", "Fisheye624",
 )  # fmt: skip
 # The terms off the curve that are found for a model.
 ASIDE = {"BrownConrady": {"tangential": 2}, "Mei": {"tangential": 2},
          "Fisheye624": {"tangential": 2, "prism": 4}}  # fmt: skip
+HOPELESS = 4.0  # times the standard deviation of a corner from another model
 OFF = 6.0  # standard deviations: a corner this far off does not fit
 SHARPEST = 0.05  # px: no detector finds corners better than this
 # For doubts.
@@ -108,11 +110,11 @@ class Calibration:
         lens = self.lens.with_theta_max(None)
         rays, count = lens.unproject_points(pixels.reshape(-1, 2)), len(self._vector)
 
-        def place(numbers: Tensor) -> Tensor:
-            turned = torch.linalg.cross(numbers[count:].expand_as(rays), rays)
-            return self._free.at(numbers[:count], lens.theta_max).project_points(rays + turned)
+        def places(numbers: Tensor) -> Tensor:
+            turned = torch.linalg.cross(*torch.broadcast_tensors(numbers[:, None, count:], rays))
+            return self._free.at(numbers[:, :count], lens.theta_max).project_points(rays + turned)
 
-        slopes = torch.func.jacfwd(place)(torch.cat((self._vector, torch.zeros(3).to(rays))))
+        slopes = slopes_of(places, torch.cat((self._vector, torch.zeros(3).to(rays))))
         (a, b), (_, d) = ((slopes @ self._joint @ slopes.mT)[:, k].unbind(1) for k in (0, 1))
         spread = (a + d) / 2 + torch.hypot(b, (a - d) / 2)
         return spread.sqrt().reshape(pixels.shape[:-1])
@@ -120,9 +122,12 @@ class Calibration:
     def uncertainty_of_theta(self, theta: Any) -> Tensor:
         """(...,) px: the standard deviation of the radius r(θ), for θ (...,) rad."""
         theta = torch.as_tensor(theta, dtype=torch.float64)
-        slopes = torch.func.jacfwd(
-            lambda vector: self._free.at(vector, self.lens.theta_limit).project(theta.flatten())
-        )(self._vector)
+        slopes = slopes_of(
+            lambda vectors: self._free.at(vectors, self.lens.theta_limit).project(
+                theta.view(1, -1)
+            ),
+            self._vector,
+        )
         return ((slopes @ self.covariance) * slopes).sum(-1).sqrt().reshape(theta.shape)
 
     def to_dict(self) -> dict[str, Any]:
@@ -188,7 +193,8 @@ def calibrate(
     for kind in kinds:
         say(f"Refining the lens: {kind.__name__}")
         try:
-            found.append(_find(kind, terms, views, start, size, square_pixels))
+            least = min((one.sigma for one in found), default=math.inf)
+            found.append(_find(kind, terms, views, start, size, square_pixels, least))
         except (CalibrationError, torch.linalg.LinAlgError) as error:
             reason = (
                 error if isinstance(error, CalibrationError) else "Its equations have no solution."
@@ -291,18 +297,24 @@ def _state(lens: Lens, square_pixels: bool, poses: tuple[Tensor, Tensor]) -> tup
 
 def _find(
     model: type[Lens], terms: int | None, views: Views, start: radial.Start,
-    size: tuple[int, int], square_pixels: bool,
+    size: tuple[int, int], square_pixels: bool, least: float,
 ) -> _Found:  # fmt: skip
-    """The lens of a model and the poses, from all pictures that agree."""
+    """The lens of a model and the poses, from all pictures that agree; or a rough answer, if it is
+    much worse than the `least` standard deviation of a corner so far."""
     rays, used, board = start.rays(views.corners), start.fits, views.board[:, :2]
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
     poses = radial.poses(rays, views.seen.to(rays), board)
     free, state = _state(start.lens(model, terms, top, size), square_pixels, poses)
+    agreeing = views._replace(seen=views.seen & used[:, None])
+    state, scale = refine(agreeing, free, state, rough=True)
     if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
-        state, _ = refine(views._replace(seen=views.seen & used[:, None]), free, state)
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
         free, state = _state(state.lens.replace(**zeros), square_pixels, state[2:])
+        state, scale = refine(agreeing, free, state, rough=True)
+    found = _Found(free, state, scale, views, used)
+    if found.sigma > HOPELESS * max(least, SHARPEST):
+        return found
     for _ in range(4):
         counts = views.seen & used[:, None]
         state, scale = refine(views._replace(seen=counts), free, state)
