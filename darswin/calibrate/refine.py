@@ -14,9 +14,10 @@ from darswin.lens import Lens, OCam, OCamInverse, Tabulated
 from darswin.lens.fitting import Packing, slopes_of
 from darswin.lens.solve import length_of
 
-ROUNDS = 100
+ROUNDS = 50
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
-FINEST = 1e-4  # px: the least scale
+OFF = 6.0  # standard deviations: a corner this far off does not fit
+SHARPEST = 0.05  # px: no detector finds corners better than this
 # The distance that 50 % and 97 % of the corners do not exceed, in standard deviations.
 MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
@@ -217,12 +218,13 @@ def refine(
     """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss.
 
     The scale follows the worst corners first; then, unless `rough`, the typical ones."""
-    scale = math.inf
+    sigma = math.inf
     for part, typical, least_gain in ((0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5))[: 2 - rough]:
         miss, damping, still = views.miss(state), 1e-3, 0
         for _ in range(ROUNDS):
             distance = miss.norm(dim=-1)[views.seen].quantile(part).item()
-            scale = max(min(scale, SCALE * distance / typical), FINEST)
+            sigma = min(sigma, distance / typical)
+            scale = SCALE * max(sigma, SHARPEST)
             before = cost = losses(miss, scale).sum().item()
             slopes, weights = views.slopes(free, state), weights_of(miss, scale)
             normal = Normal(slopes, miss, weights, free, state.vector, lens_moves)
