@@ -103,7 +103,8 @@ def calibrate(
     if not found:
         raise CalibrationError(failed[0][3])
     # A corner that fits any model counts for all: no model may leave out the rim.
-    counts = torch.stack([one.fits for one in found]).any(0)
+    sigma = min(one.sigma for one in found)
+    counts = torch.stack([one.fits(sigma) for one in found]).any(0)
     for one in found:
         one.judge(views, counts)
     found.sort(key=lambda one: one.left_out)
@@ -118,7 +119,7 @@ def calibrate(
         return value.new_full((count, *value.shape[1:]), rest).index_put((usable,), value)
 
     lens, seen = best.state.lens, views.seen
-    supported = theta[best.fits].quantile(0.99).item()
+    supported = theta[best.fits(best.sigma)].quantile(0.99).item()
     lens = lens.with_theta_max(reach(lens))
     calibration = Calibration(
         lens=lens,
@@ -165,12 +166,14 @@ class _Found:
     def __init__(self, free: Free, state: State, scale: float, views: Views, used: Tensor):
         self.free, self.state, self.scale, self.used = free, state, scale, used
         self.miss = views.miss(state)
-        counts = views.seen & used[:, None]
-        distance = self.miss.norm(dim=-1)
-        numbers = 2 * int(counts.sum())
+        self.counts, self.distance = views.seen & used[:, None], self.miss.norm(dim=-1)
+        numbers, typical = 2 * int(self.counts.sum()), self.distance[self.counts].median().item()
         spare = max(numbers - len(state.vector) - 6 * int(used.sum()), 1)
-        self.sigma = distance[counts].median().item() / MEDIAN * math.sqrt(numbers / spare)
-        self.fits = counts & (distance <= OFF * max(self.sigma, SHARPEST))
+        self.sigma = typical / MEDIAN * math.sqrt(numbers / spare)
+
+    def fits(self, sigma: float) -> Tensor:
+        """(P, K) bool: the corners that fit, if `sigma` px is their standard deviation."""
+        return self.counts & (self.distance <= OFF * max(sigma, SHARPEST))
 
     def judge(self, views: Views, counts: Tensor) -> None:
         """Computes the covariance and the errors, over the corners that count, (P, K)."""

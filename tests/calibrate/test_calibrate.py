@@ -303,3 +303,11 @@ def test_a_wrong_model_ends_in_words(usual):
         CalibrationError, match=r"The corners reach 9\d° from the axis, but a Persp"
     ):
         of(usual, "Perspective")
+
+
+def test_a_wrong_model_makes_no_outlier_count(usual):
+    corners = usual.corners.clone()
+    corners[3, 10] += 4.0
+    found = of(usual._replace(corners=corners), "auto")
+    assert found.left_out == pytest.approx(of(usual).left_out, rel=0.05)
+    assert found.doubts[0].startswith("corner 11 of picture 4 is ")
