@@ -60,7 +60,7 @@ def test_closed_streams_are_no_place_for_files(tmp_path):
 
 
 def test_a_stop_by_the_keyboard_has_its_code_and_no_traceback(monkeypatch, capsys):
-    def stopped(*_):
+    def stopped():
         raise KeyboardInterrupt
 
     monkeypatch.setattr("darswin.cli.info.models", stopped)
