@@ -24,16 +24,17 @@ from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
 
 MOST, FEWEST = 120, 10  # curves: of a picture, of all
+ENOUGH = 300  # curves that find the centre better than the middle of the picture
 STEP = 4  # points of an edge that are averaged
-TOLERANCE = 0.3  # px, by which a line misses
-ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
-LONGEST = 15
-SHAPE = 10.0
-FRAME = 0.03
+FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
+TOLERANCE = 0.3  # px, by which a line misses; curves that miss by STRAIGHT times it are not lines
 STRAIGHT = 3.0
-BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.12, 4, 40)  # a₁ and h₀ that are tried
+ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
+BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
+LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
+USUAL = 10.0  # the weight of what usual lenses are like
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
-UNSURE, OFF, COVERED = 0.05, 2.0, 0.8  # of the rim's angle; px; of the radius
+UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
 NARROWEST = math.radians(3)  # at the rim
 
 
@@ -44,8 +45,7 @@ class Estimate:
     Attributes:
         lens: one lens in float64.
         rim: rad, its θ at `radius`, px: at the image circle, or at the nearest side without one.
-        interval: rad: the least and the largest θ at the rim that the pictures allow, one standard
-            deviation around all answers that are nearly as good.
+        interval: rad: the least and the largest θ at the rim, one standard deviation around it.
         curves: the number of curves that are straight with this lens.
         covered: the part of the radius, in [0, 1], on which they lie.
         verdict: what supports the lens, in one sentence; doubts: sentences on what does not.
@@ -123,13 +123,14 @@ def from_curves(
     for number, of_picture in enumerate(curves):
         for curve in of_picture[:MOST]:
             points = curve[: len(curve) // STEP * STEP].reshape(-1, STEP, 2).mean(1)
-            # The edges of the image circle, or of a black frame, are not of the world.
+            # The edges of the image circle, and of a black frame, are not of the world.
             at_rim = circle and (np.hypot(*(points - circle[:2]).T) > 0.98 * radius).mean() > 0.1
             from_sides = np.hstack((points, (width - 1, height - 1) - points))
             if len(points) > 3 and not at_rim and from_sides.max(0).min() > FRAME * radius:
                 pieces.append(points / radius)
                 picture.append(number)
-    about = 1e-4 if center else 0.001 if circle else 0.002
+    middle = 0.02 if len(pieces) > ENOUGH else 0.002
+    about = 1e-4 if center else 0.001 if circle else middle
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
     found = _search(_Lines(pieces, np.array(picture), radius / TOLERANCE, *known))
@@ -171,6 +172,8 @@ def from_curves(
         "the pictures allow very different lenses: give more of them": high - low
         > 2 * UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
+        f"only {best.agree:.0%} of the lines agree with orthogonal directions": not fov
+        and best.agree < AGREE,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
     }
     said = tuple(doubt for doubt, holds in doubts.items() if holds)
@@ -190,30 +193,32 @@ class _Lines:
 
     A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
     at the distance ρ from the centre (x, y). scale: of a radius, in units of TOLERANCE; center:
-    (x, y, standard deviation); rim: θ at ρ = 1; believed: (5,) is added to what is `unusual`.
+    (x, y, standard deviation); rim: θ at ρ = 1; belief: (6,), is added to what is `unusual`.
     """
 
     def __init__(
         self, pieces: list[np.ndarray], picture: np.ndarray, scale: float, center: np.ndarray,
-        rim: float | None, believed: np.ndarray | float = 0.0,
+        rim: float | None, belief: np.ndarray | float = 0.0,
     ):  # fmt: skip
         self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
-        self.rim, self.believed, self.points = rim, believed, np.concatenate(pieces)
+        self.rim, self.belief, self.points = rim, belief, np.concatenate(pieces)
         self.counts = np.array([len(piece) for piece in pieces])
         self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
 
-    def some(self, keep: np.ndarray, believed: np.ndarray | float = 0.0) -> "_Lines":
+    def some(self, keep: np.ndarray, belief: np.ndarray | float = 0.0) -> "_Lines":
         kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
-        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, believed)
+        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, belief)
 
     def unusual(self, v: np.ndarray) -> np.ndarray:
         """How far a lens is from usual ones, and from what is known."""
         bend, about = abs(v[1]), (v[4:] - self.center[:2]) / self.center[2]
-        # Usual shapes are between those of stereographic and equidistant lenses.
+        # Usual shapes are between those of stereographic and equidistant lenses. The bend for the
+        # scale, -a₁ h₀², is 0 for perspective, 1/4 and 1/3 for these, 1/2 for orthographic lenses.
         second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
         third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
+        scale = -4 * v[1] * math.exp(2 * v[0]) - 1
         off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
-        return np.array((SHAPE * second, SHAPE * third, *about, off)) + self.believed
+        return np.array((USUAL * second, USUAL * third, USUAL * scale, *about, off)) + self.belief
 
 
 def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -237,9 +242,9 @@ class _Seen:
 
     All distances are in units of TOLERANCE. Attributes: miss: of the points; straightness: (C,),
     its mean square for each curve; normal: (C, 3), of the planes, with the signs of those of
-    `like`. After `orient`, axes: three orthogonal directions (3, 3) of each picture; apart: (C,),
-    the root of the sum of squares that the nearest direction adds to a curve; nearest: (C,), its
-    number; rows of the least-squares problem, and their cost.
+    `like`. After `orient`, axes: three orthogonal directions (3, 3) of each picture; along: (C,),
+    the number of the direction of a curve, or -1; agree: in [0, 1], how many do; rows of the
+    least-squares problem; cost.
     """
 
     def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | None = None):
@@ -273,13 +278,14 @@ class _Seen:
         return _rim(self.v)
 
     def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """`apart`, with a sign, of curves (K,) from directions (..., 3); (K, ...)."""
+        """How far, with a sign, curves (K,) are from directions (..., 3), as an array (K, ...): the
+        root of the sum of squares of misses that is added if the curve has this direction."""
         part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
         spread = self.spread[of].reshape(len(of), 2, *[1] * (directions.ndim - 1))
         return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
 
     def nearest_of(self, axes: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`apart`, with a sign, and the number, of the nearest of axes (3, 3) to curves (K,)."""
+        """`from_directions` and the number of the nearest of axes (3, 3) to each of curves (K,)."""
         apart = self.from_directions(axes, of)
         nearest = np.abs(apart).argmin(1)
         return apart[np.arange(len(of)), nearest], nearest
@@ -293,8 +299,12 @@ class _Seen:
         second = _unit(np.cross(first, normal))
         first = np.broadcast_to(first, second.shape)
         axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
-        square = (self.from_directions(axes, of) ** 2).min(-1).T
-        return axes[(square / (1 + square / counts)).sum(1).argmin()]
+        apart = np.abs(self.from_directions(axes, of)).min(-1).T
+        likely = _robust(apart, counts).sum(1).argsort(kind="stable")[:LIKELY]
+        return min(
+            (self.turned(axes[k], of) for k in likely),
+            key=lambda turned: _robust(self.nearest_of(turned, of)[0], counts).sum(),
+        )
 
     def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Directions near `axes` that fit the curves of a picture better."""
@@ -315,12 +325,15 @@ class _Seen:
         """Itself with all attributes, from directions nearby."""
         counts, of = self.lines.counts, self.lines.of
         self.axes = {p: self.turned(near, of[p]) for p, near in axes.items() if p in of}
-        self.apart, self.nearest = np.zeros(len(counts)), np.full(len(counts), -1)
+        apart, self.along = np.zeros(len(counts)), np.full(len(counts), -1)
         for p, found in self.axes.items():
-            self.apart[of[p]], self.nearest[of[p]] = self.nearest_of(found, of[p])
+            apart[of[p]], nearest = self.nearest_of(found, of[p])
+            agrees = apart[of[p]] ** 2 < STRAIGHT**2 * counts[of[p]]
+            self.along[of[p]] = np.where(agrees, nearest, -1)
+        self.agree = 1 - _robust(apart, counts).sum() / counts.sum()
         # A curve that misses its plane or its direction by more than TOLERANCE counts little.
         bends = self.miss / np.sqrt(1 + self.straightness).repeat(counts)
-        turns = math.sqrt(ORTHOGONAL) * self.apart / np.sqrt(1 + self.apart**2 / counts)
+        turns = math.sqrt(ORTHOGONAL) * apart / np.sqrt(1 + apart**2 / counts)
         self.rows = np.concatenate((bends, turns, self.lines.unusual(self.v)))
         self.cost = self.rows @ self.rows
         return self
@@ -336,8 +349,6 @@ class _Seen:
 
             rows = at(best.v).rows
             slopes = np.stack([at(best.v + d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
-            if not best.axes:  # straightness does not depend on h₀
-                slopes[:, 0] = 0
             square, slope = slopes.T @ slopes, slopes.T @ rows
             while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
@@ -350,11 +361,8 @@ class _Seen:
 
     def oriented_pictures(self) -> int:
         """The number of pictures with several lines in each of two orthogonal directions."""
-        along = np.where(self.apart**2 < self.lines.counts, self.nearest, -1)
-        return sum(
-            sum(int((along[of] == k).sum() > 2) for k in range(3)) > 1
-            for of in self.lines.of.values()
-        )
+        lines = ([(self.along[of] == k).sum() for k in range(3)] for of in self.lines.of.values())
+        return sum(sorted(numbers)[1] > 2 for numbers in lines)
 
     def lens(self, size: tuple[int, int]) -> OCam:
         """As a lens for pictures of (H, W)."""
@@ -362,6 +370,15 @@ class _Seen:
         numbers = [-h * scale, 0, -h * a / scale, 0, -h * b / scale**3, 0, -h * c / scale**5]
         center = torch.from_numpy(scale * self.v[4:])
         return OCam(torch.tensor(numbers, dtype=torch.float64), center=center, image_size=size)
+
+
+def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return apart**2 / (1 + apart**2 / counts)
+
+
+def _oriented(lines: _Lines, v: np.ndarray) -> _Seen:
+    seen = _Seen(lines, v)
+    return seen.orient({p: seen.best_axes(of) for p, of in lines.of.items() if len(of) >= 3})
 
 
 def _search(lines: _Lines) -> list[_Seen]:
@@ -375,36 +392,36 @@ def _search(lines: _Lines) -> list[_Seen]:
     _check(straight.sum())
     lines, starts = lines.some(straight), []
     for depth in DEPTHS:
-        start = _Seen(lines, np.array((math.log(depth), *shape.v[1:])))
-        axes = {p: start.best_axes(of) for p, of in lines.of.items() if len(of) >= 3}
-        starts.append(start.orient(axes))
+        starts.append(_oriented(lines, np.array((math.log(depth), *shape.v[1:]))))
+        if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
+            break
     costs = [start.cost for start in starts]
-    lows = [s for k, s in enumerate(starts) if s.cost == min(costs[max(k - 2, 0) : k + 3])]
-    if lines.rim is not None:
-        lows = [min(starts, key=lambda start: abs(start.rim - lines.rim))]
-    fits = [low.refined(5) for low in sorted(lows, key=lambda low: low.cost)[:3]]
-    least = min(f.cost for f in fits)
+    fits = [s for k, s in enumerate(starts) if s.cost == min(costs[max(k - 2, 0) : k + 3])]
+    if (known := lines.rim) is not None:
+        fits = [min(starts, key=lambda start: abs(start.rim - known))]
+    fits = sorted(fits, key=lambda fit: fit.cost)[:LOWS]
+    for _ in range(3):
+        fits = [fit.refined(5) for fit in fits]
+        fits = [min(fit, _oriented(lines, fit.v), key=lambda fit: fit.cost) for fit in fits]
+    least = min(fit.cost for fit in fits)
     return sorted((f.refined() for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
 
 
 def _deviation(fits: list[_Seen]) -> float:
     """The standard deviation of the rim, rad: by the jackknife over groups of neighbouring curves,
-    whose errors are alike, and by other beliefs on the shape and the centre."""
+    whose errors are alike, and by other beliefs on usual lenses and on the centre."""
     lines, best = fits[0].lines, fits[0]
 
-    def rim(keep: np.ndarray, believed: np.ndarray | float = 0.0) -> float:
-        some = lines.some(keep, believed)
-        other = [_Seen(some, f.v).orient(f.axes).refined(8) for f in fits]
-        return min(other, key=lambda f: f.cost).rim
+    def rim(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> float:
+        some = lines.some(keep, belief)
+        answers = [_Seen(some, fit.v).orient(fit.axes).refined(8) for fit in fits]
+        return min(answers, key=lambda answer: answer.cost).rim
 
     x, y = np.array([piece.mean(0) for piece in lines.pieces]).T - best.v[4:, None]
     group = np.empty(len(x), int)
     group[np.lexsort((np.arctan2(y, x), lines.picture))] = np.arange(len(x)) * GROUPS // len(x)
     without = [rim(group != k) for k in range(GROUPS)]
-    beliefs = np.diag((SHAPE, SHAPE, 5, 5, 0))[:4]
-    other = [rim(group >= 0, believed) - best.rim for believed in beliefs]
-    DEBUG.append((math.sqrt((GROUPS - 1) * np.var(without)), other, [(f.rim, f.cost) for f in fits]))
-    return math.sqrt((GROUPS - 1) * np.var(without) + np.square(other).sum())
-
-
-DEBUG = []
+    # How far lenses differ from `usual` ones and their centres from the middle.
+    beliefs = np.diag((0.5 * USUAL, 0.5 * USUAL, 0.4 * USUAL, 5, 5, 0))[:5]
+    changes = [rim(group >= 0, belief) - best.rim for belief in beliefs]
+    return math.sqrt((GROUPS - 1) * np.var(without) + np.square(changes).sum())
