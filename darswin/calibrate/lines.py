@@ -35,6 +35,7 @@ LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that
 USUAL = 10.0  # the weight of what usual lenses are like
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
+SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
 
 
@@ -135,8 +136,8 @@ def from_curves(
     _check(len(pieces))
     found = _search(_Lines(pieces, np.array(picture), radius / TOLERANCE, *known))
     best = found[0]
-    oriented = best.oriented_pictures()
-    if fov is None and not oriented:
+    second = best.in_second_direction()
+    if fov is None and second.max() < SECOND[0]:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
             "in two orthogonal directions: give other pictures, or the image circle's field of view"
@@ -162,6 +163,7 @@ def from_curves(
     sigma = math.hypot(0.0 if fov else _deviation(found), rim - best.rim)
     low, high = rim - sigma, rim + sigma
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
+    oriented = (second >= SECOND[0]).sum()
     source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
@@ -172,6 +174,8 @@ def from_curves(
         "the pictures allow very different lenses: give more of them": high - low
         > 2 * UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
+        f"only {second.max()} lines of a picture have a second direction": not fov
+        and second.max() < SECOND[1],
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": not fov
         and best.agree < AGREE,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
@@ -359,10 +363,10 @@ class _Seen:
                 break
         return found
 
-    def oriented_pictures(self) -> int:
-        """The number of pictures with several lines in each of two orthogonal directions."""
-        lines = ([(self.along[of] == k).sum() for k in range(3)] for of in self.lines.of.values())
-        return sum(sorted(numbers)[1] > 2 for numbers in lines)
+    def in_second_direction(self) -> np.ndarray:
+        """The number of lines in the second of the orthogonal directions of each picture."""
+        lines = [[(self.along[of] == k).sum() for k in range(3)] for of in self.lines.of.values()]
+        return np.sort(lines)[:, 1]
 
     def lens(self, size: tuple[int, int]) -> OCam:
         """As a lens for pictures of (H, W)."""
