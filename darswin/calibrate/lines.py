@@ -9,7 +9,9 @@ Source: Devernay and Faugeras, MVA 2001; Coughlan and Yuille, ICCV 1999.
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,12 +25,10 @@ from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
 
-MOST, FEWEST = 120, 10  # curves: of a picture, of all
-ENOUGH = 300  # curves that find the centre better than the middle of the picture
+MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
 STEP = 4  # points of an edge that are averaged
 FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
-TOLERANCE = 0.3  # px, by which a line misses; curves that miss by STRAIGHT times it are not lines
-STRAIGHT = 3.0
+TOLERANCE, STRAIGHT = 0.3, 3.0  # px, by which a line misses; times it: other curves
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
 LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
@@ -37,6 +37,9 @@ GROUPS = 8  # of curves; the answers without each of them show the uncertainty
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
+
+
+_cost = attrgetter("cost")
 
 
 @dataclass(frozen=True)
@@ -67,13 +70,10 @@ class Estimate:
 
 
 def estimate(
-    pictures: Sequence[np.ndarray],
-    model: str = "Spherical",
-    *,
-    center: tuple[float, float] | None = None,
-    fov: float | None = None,
+    pictures: Sequence[np.ndarray], model: str = "Spherical", *,
+    center: tuple[float, float] | None = None, fov: float | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """Finds the lens of a camera from pictures with straight edges.
 
     Args:
@@ -108,14 +108,10 @@ def estimate(
 
 
 def from_curves(
-    curves: Sequence[Sequence[np.ndarray]],
-    size: tuple[int, int],
-    model: str = "Spherical",
-    *,
-    center: tuple[float, float] | None = None,
-    fov: float | None = None,
+    curves: Sequence[Sequence[np.ndarray]], size: tuple[int, int], model: str = "Spherical", *,
+    center: tuple[float, float] | None = None, fov: float | None = None,
     circle: tuple[float, float, float] | None = None,
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """`estimate` from the curves of each picture, (n, 2) px; circle: (x, y, radius), px."""
     height, width = size
     x, y = center or (circle[:2] if circle else ((width - 1) / 2, (height - 1) / 2))
@@ -130,13 +126,13 @@ def from_curves(
             if len(points) > 3 and not at_rim and from_sides.max(0).min() > FRAME * radius:
                 pieces.append(points / radius)
                 picture.append(number)
-    middle = 0.02 if len(pieces) > ENOUGH else 0.002
-    about = 1e-4 if center else 0.001 if circle else middle
+    about = 1e-4 if center else 0.001 if circle else 0.02 if len(pieces) > ENOUGH else 0.002
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
     found = _search(_Lines(pieces, np.array(picture), radius / TOLERANCE, *known))
     best = found[0]
-    second = best.in_second_direction()
+    along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
+    second = np.sort(along)[:, 1]
     if fov is None and second.max() < SECOND[0]:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
@@ -146,15 +142,13 @@ def from_curves(
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
-        try:
+        with suppress(ValueError):
             lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
             break
-        except ValueError as reason:
-            if part == 0.8:
-                raise CalibrationError(
-                    f"no {model} lens is close to what the lines show: give more pictures, or "
-                    "try another model"
-                ) from reason
+    else:
+        raise CalibrationError(
+            f"no {model} lens is close to what the lines show: give more pictures, or another model"
+        )
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
     if rim < NARROWEST:
@@ -170,14 +164,12 @@ def from_curves(
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
     )
+    few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        "the pictures allow very different lenses: give more of them": high - low
-        > 2 * UNSURE * rim,
+        "the pictures allow very different lenses: give more of them": sigma > UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
-        f"only {second.max()} lines of a picture have a second direction": not fov
-        and second.max() < SECOND[1],
-        f"only {best.agree:.0%} of the lines agree with orthogonal directions": not fov
-        and best.agree < AGREE,
+        f"only {second.max()} lines of a picture have a second direction": few,
+        f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
     }
     said = tuple(doubt for doubt, holds in doubts.items() if holds)
@@ -244,16 +236,14 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 class _Seen:
     """What a lens v sees: the plane through the camera that is closest, in px, to each curve.
 
-    All distances are in units of TOLERANCE. Attributes: miss: of the points; straightness: (C,),
-    its mean square for each curve; normal: (C, 3), of the planes, with the signs of those of
-    `like`. After `orient`, axes: three orthogonal directions (3, 3) of each picture; along: (C,),
-    the number of the direction of a curve, or -1; agree: in [0, 1], how many do; rows of the
-    least-squares problem; cost.
+    In units of TOLERANCE: miss, of the points; straightness: (C,), its mean square for each curve.
+    normal: (C, 3), of the planes, with the signs of `like`. After `orient`, axes: three orthogonal
+    directions (3, 3) of each picture; along: (C,), the number of a curve's direction, or -1; agree:
+    in [0, 1], how many have one; rows of the least-squares problem; cost.
     """
 
-    def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | None = None):
-        self.lines, self.v = lines, v
-        self.normal: np.ndarray
+    def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | float = 1.0):
+        self.lines, self.v, self.rim = lines, v, _rim(v)
         offset = lines.points - v[4:]
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
@@ -271,19 +261,13 @@ class _Seen:
             weight = 1 / ((normal * along).sum(1) ** 2 + (normal * across).sum(1) ** 2)
         self.miss = lines.scale * (normal * ray).sum(1) * np.sqrt(weight)
         self.straightness = np.add.reduceat(self.miss**2, starts) / lines.counts
-        if like is not None:  # a plane has two normals
-            sign = np.sign((self.own[:, :, 0] * like).sum(1) + 1e-9)
-            self.own *= sign[:, None, None]
-            self.miss *= sign.repeat(lines.counts)
+        sign = np.sign((self.own[:, :, 0] * like).sum(1) + 1e-9)  # a plane has two normals
+        self.own *= sign[:, None, None]
+        self.miss *= sign.repeat(lines.counts)
         self.normal, self.spread = self.own[:, :, 0], np.maximum(spread[:, 1:], 1e-9)
 
-    @property
-    def rim(self) -> float:
-        return _rim(self.v)
-
     def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """How far, with a sign, curves (K,) are from directions (..., 3), as an array (K, ...): the
-        root of the sum of squares of misses that is added if the curve has this direction."""
+        """How far, with a sign, curves (K,) are from directions (..., 3), as an array (K, ...)."""
         part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
         spread = self.spread[of].reshape(len(of), 2, *[1] * (directions.ndim - 1))
         return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
@@ -305,10 +289,8 @@ class _Seen:
         axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
         apart = np.abs(self.from_directions(axes, of)).min(-1).T
         likely = _robust(apart, counts).sum(1).argsort(kind="stable")[:LIKELY]
-        return min(
-            (self.turned(axes[k], of) for k in likely),
-            key=lambda turned: _robust(self.nearest_of(turned, of)[0], counts).sum(),
-        )
+        turned = [self.turned(axes[k], of) for k in likely]
+        return min(turned, key=lambda t: _robust(self.nearest_of(t, of)[0], counts).sum())
 
     def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Directions near `axes` that fit the curves of a picture better."""
@@ -325,15 +307,16 @@ class _Seen:
             axes = u @ vh
         return axes
 
-    def orient(self, axes: dict[int, np.ndarray]) -> "_Seen":
-        """Itself with all attributes, from directions nearby."""
+    def orient(self, axes: dict[int, np.ndarray] | None = None) -> "_Seen":
+        """Itself with all attributes, from directions nearby or from the best."""
         counts, of = self.lines.counts, self.lines.of
+        if axes is None:
+            axes = {p: self.best_axes(curves) for p, curves in of.items() if len(curves) > 2}
         self.axes = {p: self.turned(near, of[p]) for p, near in axes.items() if p in of}
         apart, self.along = np.zeros(len(counts)), np.full(len(counts), -1)
         for p, found in self.axes.items():
-            apart[of[p]], nearest = self.nearest_of(found, of[p])
-            agrees = apart[of[p]] ** 2 < STRAIGHT**2 * counts[of[p]]
-            self.along[of[p]] = np.where(agrees, nearest, -1)
+            apart[of[p]], self.along[of[p]] = self.nearest_of(found, of[p])
+        self.along[apart**2 > STRAIGHT**2 * counts] = -1
         self.agree = 1 - _robust(apart, counts).sum() / counts.sum()
         # A curve that misses its plane or its direction by more than TOLERANCE counts little.
         bends = self.miss / np.sqrt(1 + self.straightness).repeat(counts)
@@ -342,31 +325,24 @@ class _Seen:
         self.cost = self.rows @ self.rows
         return self
 
+    def moved(self, step: np.ndarray | float) -> "_Seen":
+        return _Seen(self.lines, self.v + step, self.normal).orient(self.axes)
+
     def refined(self, steps: int = 30) -> "_Seen":
         """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
         found, damping = self, 1e-3
         for _ in range(steps):
-            best = found
-
-            def at(v: np.ndarray, best: _Seen = best) -> _Seen:
-                return _Seen(best.lines, v, best.normal).orient(best.axes)
-
-            rows = at(best.v).rows
-            slopes = np.stack([at(best.v + d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
+            best, rows = found, found.moved(0).rows
+            slopes = np.stack([best.moved(d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
             square, slope = slopes.T @ slopes, slopes.T @ rows
             while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = at(best.v - np.linalg.solve(damped, slope))
+                trial = best.moved(-np.linalg.solve(damped, slope))
                 found = trial if trial.cost < best.cost else best
                 damping *= 10 if found is best else 0.1
             if found.cost > (1 - 1e-4) * best.cost:
                 break
         return found
-
-    def in_second_direction(self) -> np.ndarray:
-        """The number of lines in the second of the orthogonal directions of each picture."""
-        lines = [[(self.along[of] == k).sum() for k in range(3)] for of in self.lines.of.values()]
-        return np.sort(lines)[:, 1]
 
     def lens(self, size: tuple[int, int]) -> OCam:
         """As a lens for pictures of (H, W)."""
@@ -380,11 +356,6 @@ def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return apart**2 / (1 + apart**2 / counts)
 
 
-def _oriented(lines: _Lines, v: np.ndarray) -> _Seen:
-    seen = _Seen(lines, v)
-    return seen.orient({p: seen.best_axes(of) for p, of in lines.of.items() if len(of) >= 3})
-
-
 def _search(lines: _Lines) -> list[_Seen]:
     """The lenses that fit best, the best first."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
@@ -396,19 +367,18 @@ def _search(lines: _Lines) -> list[_Seen]:
     _check(straight.sum())
     lines, starts = lines.some(straight), []
     for depth in DEPTHS:
-        starts.append(_oriented(lines, np.array((math.log(depth), *shape.v[1:]))))
+        starts.append(_Seen(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
         if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
             break
-    costs = [start.cost for start in starts]
-    fits = [s for k, s in enumerate(starts) if s.cost == min(costs[max(k - 2, 0) : k + 3])]
+    fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
     if (known := lines.rim) is not None:
         fits = [min(starts, key=lambda start: abs(start.rim - known))]
-    fits = sorted(fits, key=lambda fit: fit.cost)[:LOWS]
+    fits = sorted(fits, key=_cost)[:LOWS]
     for _ in range(3):
         fits = [fit.refined(5) for fit in fits]
-        fits = [min(fit, _oriented(lines, fit.v), key=lambda fit: fit.cost) for fit in fits]
-    least = min(fit.cost for fit in fits)
-    return sorted((f.refined() for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
+        fits = [min(fit, _Seen(lines, fit.v).orient(), key=_cost) for fit in fits]
+    least = min(map(_cost, fits))
+    return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)
 
 
 def _deviation(fits: list[_Seen]) -> float:
@@ -418,8 +388,7 @@ def _deviation(fits: list[_Seen]) -> float:
 
     def rim(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> float:
         some = lines.some(keep, belief)
-        answers = [_Seen(some, fit.v).orient(fit.axes).refined(8) for fit in fits]
-        return min(answers, key=lambda answer: answer.cost).rim
+        return min((_Seen(some, f.v).orient(f.axes).refined(8) for f in fits), key=_cost).rim
 
     x, y = np.array([piece.mean(0) for piece in lines.pieces]).T - best.v[4:, None]
     group = np.empty(len(x), int)
