@@ -155,7 +155,7 @@ def from_curves(
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
     sigma = math.hypot(0.0 if fov else _deviation(found), rim - best.rim)
-    low, high = rim - sigma, rim + sigma
+    low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
     oriented = (second >= SECOND[0]).sum()
     source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"

@@ -215,6 +215,12 @@ def test_no_lens_at_all_is_no_answer(monkeypatch):
         from_curves(curves, SIZE)
 
 
+def test_an_interval_has_only_angles_of_lenses(monkeypatch):
+    monkeypatch.setattr(lines, "_deviation", lambda fits: 9.0)
+    found = from_curves([curves_of(LENSES["equisolid"], 1)], SIZE)
+    assert found.interval == (0.0, math.pi) and "very different lenses" in found.doubts[0]
+
+
 def test_an_estimate_is_the_same_bits_again():
     curves = [curves_of(LENSES["equisolid"], 1)]
     one, two = (from_curves(curves, SIZE).to_dict() for _ in range(2))
