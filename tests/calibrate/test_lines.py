@@ -166,14 +166,14 @@ def test_short_edges_of_a_board_in_many_poses_determine_a_narrow_lens():
     assert found.rim == pytest.approx(rim_of(lens), rel=0.03) and found.doubts == ()
 
 
-def test_an_interval_holds_the_truth_in_about_two_cases_of_three():
-    held = 0
+def test_an_interval_holds_the_truth_in_two_cases_of_three():
+    misses = []
     for seed in range(12):
         lens = list(LENSES.values())[seed % 9]
-        off = np.random.default_rng(seed).uniform(-2, 2, 2)
-        found = from_curves([curves_of(lens, seed, bent=20, askew=10, center=off)], SIZE)
-        held += found.interval[0] <= rim_of(lens) <= found.interval[1]
-    assert 6 <= held <= 12
+        center = np.random.default_rng(seed).uniform(-3, 3, 2)
+        low, high = from_curves([curves_of(lens, seed, noise=0.1, center=center)], SIZE).interval
+        misses.append(abs(rim_of(lens) - (low + high) / 2) / ((high - low) / 2))
+    assert sum(miss <= 1 for miss in misses) >= 8 and max(misses) < 3
 
 
 @pytest.mark.parametrize(
