@@ -28,7 +28,8 @@ from darswin.utils.parameters import check
 MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
 STEP = 4  # points of an edge that are averaged
 FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
-TOLERANCE, STRAIGHT = 0.3, 3.0  # px, by which a line misses; times it: other curves
+TOLERANCE = 0.3, 1 / 800  # px, at least, and of the radius: by which a line misses
+STRAIGHT = 3.0  # times TOLERANCE: curves that miss by more are not lines
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
 LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
@@ -129,8 +130,8 @@ def from_curves(
     about = 1e-4 if center else 0.001 if circle else 0.02 if len(pieces) > ENOUGH else 0.002
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
-    found = _search(_Lines(pieces, np.array(picture), radius / TOLERANCE, *known))
-    best = found[0]
+    scale = min(radius / TOLERANCE[0], 1 / TOLERANCE[1])
+    best, *_ = found = _search(_Lines(pieces, np.array(picture), scale, *known))
     along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
     second = np.sort(along)[:, 1]
     if fov is None and second.max() < SECOND[0]:
@@ -138,7 +139,7 @@ def from_curves(
             "straight lines alone do not tell the focal length, and no picture has several lines "
             "in two orthogonal directions: give other pictures, or the image circle's field of view"
         )
-    raw, last = best.lens(size), best.rho.max()
+    raw, last = best.lens(size, radius), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
@@ -344,12 +345,11 @@ class _Seen:
                 break
         return found
 
-    def lens(self, size: tuple[int, int]) -> OCam:
+    def lens(self, size: tuple[int, int], radius: float) -> OCam:
         """As a lens for pictures of (H, W)."""
-        scale, h, (a, b, c) = self.lines.scale * TOLERANCE, math.exp(self.v[0]), self.v[1:4]
-        numbers = [-h * scale, 0, -h * a / scale, 0, -h * b / scale**3, 0, -h * c / scale**5]
-        center = torch.from_numpy(scale * self.v[4:])
-        return OCam(torch.tensor(numbers, dtype=torch.float64), center=center, image_size=size)
+        h, (a, b, c) = math.exp(self.v[0]), self.v[1:4] / radius ** np.array((1, 3, 5))
+        numbers = torch.tensor([-h * radius, 0, -h * a, 0, -h * b, 0, -h * c], dtype=torch.float64)
+        return OCam(numbers, center=torch.from_numpy(radius * self.v[4:]), image_size=size)
 
 
 def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:

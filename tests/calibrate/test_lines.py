@@ -158,6 +158,14 @@ def test_edges_of_a_black_frame_are_no_lines():
     assert from_curves(framed, SIZE).to_dict() == from_curves(curves, SIZE).to_dict()
 
 
+def test_larger_pictures_of_the_same_sharpness_give_the_same_lens():
+    curves = curves_of(LENSES["equidistant"], 1, 25)
+    large = [np.repeat(4 * curve + 1.5, 4, 0) for curve in curves]
+    found, same = from_curves([curves], SIZE), from_curves([large], (4 * SIZE[0], 4 * SIZE[1]))
+    assert same.rim == pytest.approx(found.rim, rel=0.01) and same.curves == found.curves
+    assert same.lens.focal.item() == pytest.approx(4 * found.lens.focal.item(), rel=0.02)
+
+
 def test_short_edges_of_a_board_in_many_poses_determine_a_narrow_lens():
     """All lines of a picture are in one plane, and some edges behind it are in any direction."""
     lens = lenses.BrownConrady(f64(540.0), radial=f64(-0.27, 0.04)[None], **F64)
