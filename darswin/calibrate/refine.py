@@ -14,7 +14,7 @@ from darswin.lens import Lens, OCam, OCamInverse, Tabulated
 from darswin.lens.fitting import Packing, slopes_of
 from darswin.lens.solve import length_of
 
-ROUNDS = 50
+ROUNDS = 30
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
 OFF = 6.0  # standard deviations: a corner this far off does not fit
 SHARPEST = 0.05  # px: no detector finds corners better than this

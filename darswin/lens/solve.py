@@ -73,17 +73,18 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
         return (value > 0) & (value < torch.inf)
 
     with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
-        x = end[:, None] * torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
-        falls = ~rises(x)
-        if readable(falls) and not falls.any():
-            return end  # the usual case
-        first = falls.int().argmax(1, keepdim=True)
-        low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
-        for _ in range(50):
-            middle = (low + high) / 2
-            rising = rises(middle)
-            low, high = torch.where(rising, middle, low), torch.where(rising, high, middle)
-        return torch.where(falls.any(1), low[:, 0], end)
+        low, high = torch.zeros_like(end)[:, None], end[:, None]
+        for steps in (1024, *[32] * 10):  # down to rounding
+            parts = torch.linspace(0, 1, steps + 1, dtype=end.dtype, device=end.device)
+            x = low + (high - low) * parts
+            falls = ~rises(x)
+            if steps == 1024:
+                if readable(falls) and not falls.any():
+                    return end  # the usual case
+                ends = falls.any(1)
+            first = falls.int().argmax(1, keepdim=True)
+            low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
+        return torch.where(ends, low[:, 0], end)
 
 
 def newton(
