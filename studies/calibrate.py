@@ -20,7 +20,7 @@ import numpy as np
 from calibrate_peers import METHODS, versions
 from calibrate_rays import QUICK, Set, all_sets, make, ray_errors
 from calibrate_real import DATA, real_cameras
-from calibrate_tables import AUTO, publish
+from calibrate_tables import publish
 from jobs import key_of, run_all
 
 from darswin.utils.files import replace_file
@@ -41,7 +41,7 @@ def run_set(which: Set, seed: int, tools: dict[str, str]) -> dict:
     given, true = make(which, seed)
     results = {}
     for name, method in METHODS.items():
-        if NEEDS.get(name, "opencv") not in tools or (name == AUTO and not which.compared):
+        if NEEDS.get(name, "opencv") not in tools:
             continue
         start = seconds()
         try:

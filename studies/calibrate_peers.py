@@ -32,7 +32,8 @@ class Given:
     """What a method is given: corners (P, K, 2) px of a flat board (K, 3), rows of `columns`
     corners, in pictures of size (H, W); the angles (P, K) of the corners, degrees, by which a
     method may leave out pictures; the field of view, degrees, and a focal length, px, near the
-    axis, for methods that need a guess; and the pixels (M, 2) whose rays are asked."""
+    axis, for methods that need a guess; the true model, which one method is told; and the pixels
+    (M, 2) whose rays are asked."""
 
     corners: np.ndarray
     board: np.ndarray
@@ -41,6 +42,7 @@ class Given:
     angles: np.ndarray
     fov: float
     focal: float
+    model: str
     pixels: np.ndarray
 
     def within(self, degrees: float) -> np.ndarray:
@@ -51,10 +53,12 @@ class Given:
         return kept
 
 
-def ours(model: str) -> Callable[[Given], np.ndarray]:
+def ours(model: str | None) -> Callable[[Given], np.ndarray]:
+    """`calibrate` with a model, or with that of the true lens."""
+
     def method(given: Given) -> np.ndarray:
         try:
-            found = calibrate(given.corners, given.board[:, :2], given.size, model)
+            found = calibrate(given.corners, given.board[:, :2], given.size, model or given.model)
         except CalibrationError as error:
             raise FailedError(str(error)) from None
         return _rays(found.lens, given.pixels)
@@ -188,7 +192,10 @@ SPLINED = f"SPLINED_STEREOGRAPHIC_order=3_Nx={KNOTS}_Ny={KNOTS}_fov_x_deg={{fov}
 FLAGS = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
 CHECKED = FLAGS | cv2.CALIB_CHECK_COND
 GUESS = FLAGS | cv2.CALIB_USE_INTRINSIC_GUESS
-OURS = {"ours, KannalaBrandt": ours("KannalaBrandt"), "ours, auto": ours("auto")}
+OURS = {
+    "ours, auto": ours("auto"), "ours, KannalaBrandt": ours("KannalaBrandt"),
+    "ours, true model": ours(None),
+}  # fmt: skip
 # Each with the limit that served it best on the whole.
 PEERS = {
     "cv2.calibrateCamera": pinhole(0, 60),

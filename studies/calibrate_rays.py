@@ -23,17 +23,16 @@ GRID = 41  # the rays of 41 × 41 pixels over the picture are compared
 
 class Set(NamedTuple):
     """Which corners: the model of the true lens, its field of view in degrees, pictures, and the
-    noise of corners, px. compared: whether "auto", which is slow, is run too."""
+    noise of corners, px."""
 
     model: str
     fov: int
     pictures: int = 20
     noise: float = 0.2
-    compared: bool = False
 
 
 QUICK = (
-    Set("KannalaBrandt", 150, 8, compared=True),
+    Set("KannalaBrandt", 150, 8),
     Set("Spherical", 220, 20),
     Set("BrownConrady", 60, 5),
 )
@@ -50,18 +49,14 @@ def all_sets() -> list[Set]:
     able = {model: fovs(model) for model in MODELS}
     first, others = [], []
     for k, (model, known) in enumerate(able.items()):
-        mine = known[k % 2 :: 2]
-        first += [Set(model, fov, compared=fov == mine[k // 2 % len(mine)]) for fov in mine]
+        first += [Set(model, fov) for fov in known[k % 2 :: 2]]
         if k % 2:
             first.append(Set(model, known[k % len(known)], noise=0.0))
     for i, count in enumerate((8, 5, 30)):
         others += [
             Set(m, known[(k + i) % len(known)], count) for k, (m, known) in enumerate(able.items())
         ]
-    # Only some models have terms off the curve, so the model matters most for these lenses.
-    return [
-        of._replace(compared=True) if of.model in rigs.OFF_CURVE else of for of in first + others
-    ]
+    return first + others
 
 
 def _lens(model: str, fov: int, seed: int) -> Lens:
@@ -87,8 +82,9 @@ def make(which: Set, seed: int) -> tuple[Given, np.ndarray]:
     focal = lens.project(torch.full((1, 1), near, dtype=torch.float64)).item() / near
     flat = np.concatenate((board.numpy(), np.zeros((len(board), 1))), 1)
     given = Given(
-        rig.corners.numpy(), flat, COLUMNS, rig.size, angles.numpy(), which.fov, focal, pixels[seen]
-    )
+        rig.corners.numpy(), flat, COLUMNS, rig.size, angles.numpy(), which.fov, focal,
+        which.model, pixels[seen],
+    )  # fmt: skip
     return given, rays[seen]
 
 

@@ -16,10 +16,10 @@ NOT_RUN = "Not run yet: `make study-calibrate`."
 SUCCESS = 0.5  # degrees: a success has a smaller median error
 NOISE = 0.2  # px
 MOST_PICTURES = 20  # of the tables by field of view and by model
-OURS, AUTO, BROWN = "ours, KannalaBrandt", "ours, auto", "ours, BrownConrady"
+AUTO, ONE, TOLD = OURS = "ours, auto", "ours, KannalaBrandt", "ours, true model"
 OPENCV = "cv2.calibrateCamera"
 SHOWN = (
-    OURS, AUTO, "cv2.calibrateCamera, rational", "cv2.fisheye, flags",
+    AUTO, ONE, "cv2.calibrateCamera, rational", "cv2.fisheye, flags",
     "cv2.fisheye, flags and guess", "cv2.omnidir", "mrcal, splined",
 )  # fmt: skip
 CEILING = 3.0  # degrees: the figure shows all larger errors, and failures, here
@@ -93,7 +93,7 @@ def draw(record: dict, path: Path) -> None:
                 aside = 0.8 * ((number + 0.5) / len(SHOWN) - 0.5)
                 places.append(fovs.index(of["fov"]) + aside)
                 values.append(min(error, CEILING))
-        shape = "D" if name in (OURS, AUTO) else "o"
+        shape = "D" if name in OURS else "o"
         axes.plot(places, values, shape, ms=3.5, alpha=0.7, label=name)
     axes.axhline(SUCCESS, color="gray", lw=0.8, ls="--")
     axes.set_xticks(range(len(fovs)), [f"{fov}°" for fov in fovs])
@@ -170,30 +170,26 @@ def _mean(ratios: list[float]) -> str:
 
 def against(record: dict) -> str:
     """The mean ratio of errors to each of the others."""
-    peers = [name for name in _methods(record) if name not in (OURS, AUTO)]
-    rows = [[peer, *(_mean(ratios(record, o, peer)) for o in (OURS, AUTO))] for peer in peers]
-    return markdown(["our error over that of", OURS, AUTO], rows)
+    peers = [name for name in _methods(record) if name not in OURS]
+    rows = [[peer, *(_mean(ratios(record, o, peer)) for o in OURS)] for peer in peers]
+    return markdown(["our error over that of", *OURS], rows)
 
 
 def best_other(results: dict) -> tuple[str, float] | None:
     """The smallest median error of the other methods that succeed."""
-    good = {n: of["median"] for n, of in results.items() if n not in (OURS, AUTO) and succeeded(of)}
+    good = {n: of["median"] for n, of in results.items() if n not in OURS and succeeded(of)}
     return min(good.items(), key=lambda item: item[1]) if good else None
 
 
 def by_model(record: dict) -> str:
-    """The sets with 20 pictures and noise that "auto" gets, too."""
+    """The sets with 20 pictures and noise of each true model."""
     rows = []
-    for of in filter(lambda of: _usual(of) and of["compared"], record["sets"]):
-        best = best_other(of["results"])
-        cells = [
-            _number(of["results"][n]["median"]) if succeeded(of["results"][n]) else "–"
-            for n in (OURS, AUTO)
-        ]
-        other = "–" if best is None else f"{_number(best[1])}, {best[0]}"
-        rows.append([of["model"], f"{of['fov']}°", *cells, other])
-    heads = ["true lens", "field of view", OURS, AUTO, "best of the others"]
-    return markdown(heads, rows)
+    for model in dict.fromkeys(of["model"] for of in record["sets"]):
+        sets = [of for of in record["sets"] if _usual(of) and of["model"] == model]
+        cells = [_angle(of["results"][n].get("median", 180.0) for of in sets) for n in OURS]
+        best = [best[1] for of in sets if (best := best_other(of["results"]))]
+        rows.append([model, ", ".join(f"{of['fov']}°" for of in sets), *cells, _angle(best)])
+    return markdown(["true lens", "fields of view", *OURS, "best of the others"], rows)
 
 
 def _left_out(result: dict) -> float | None:
@@ -227,8 +223,8 @@ def real(record: dict) -> str:
 
 
 def targets(record: dict) -> str:
-    """What was aimed at, and what was found, with one model and with the best of several."""
-    found = [_targets(record, name) for name in (OURS, AUTO)]
+    """What was aimed at, and what was found."""
+    found = [_targets(record, name) for name in OURS]
     aims = {
         "success with 8 or more pictures": "all",
         "error with 20 pictures": "at most 20",
@@ -239,11 +235,11 @@ def targets(record: dict) -> str:
     rows = [[*aim, *cells] for aim, *cells in zip(aims.items(), *found, strict=True)]
     for camera in record["real"]:
         other = _left_out(camera["results"][OPENCV])
-        errors = [_left_out(camera["results"][n]) for n in (BROWN, AUTO) if n in camera["results"]]
+        errors = [_left_out(camera["results"][n]) for n in (AUTO, ONE)]
         cells = [f"{error:.4f}" for error in errors]
         aim = f"OpenCV's {other:.4f}"
-        rows.append([f"leave-one-out error (px), {camera['camera']} camera", aim, *cells])
-    return markdown(["", "target", "ours, one model", AUTO], rows)
+        rows.append([f"leave-one-out error (px), {camera['camera']} camera", aim, *cells, ""])
+    return markdown(["", "target", *OURS], rows)
 
 
 def _targets(record: dict, name: str) -> list[str]:

@@ -17,7 +17,7 @@ import torch
 
 from darswin.calibrate import edges
 from darswin.calibrate.boards import image_circle
-from darswin.calibrate.calibration import CalibrationError
+from darswin.calibrate.inputs import CalibrationError
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens, OCam, OCamInverse, Tabulated
-from darswin.lens.fitting import Packing
+from darswin.lens.fitting import Packing, slopes_of
 from darswin.lens.solve import length_of
 
-ROUNDS = 100
+ROUNDS = 50
 SCALE = 3.0  # of the Cauchy loss, in standard deviations of a corner
-FINEST = 1e-4  # px: the least scale
+OFF = 6.0  # standard deviations: a corner this far off does not fit
+SHARPEST = 0.05  # px: no detector finds corners better than this
 # The distance that 50 % and 97 % of the corners do not exceed, in standard deviations.
 MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
@@ -57,25 +58,26 @@ class Free:
         self.start, self._rest = vector[free], torch.where(free, 0, vector)
         self._places = torch.eye(len(vector)).to(vector)[:, free]
 
-    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
-        """The parameters of the lens."""
-        found = self.packing.tensors(self._rest + self._places @ vector)
+    def tensors(self, vectors: Tensor) -> dict[str, Tensor]:
+        """The parameters of the lenses of vectors (B, n)."""
+        found = self.packing.tensors(self._rest + vectors @ self._places.T)
         if self.model is OCamInverse:  # r(0) = 0
             slopes = found["coefficients"][:, 1:]
-            powers = (-math.pi / 2) ** torch.arange(1, slopes.shape[1] + 1).to(vector)
+            powers = (-math.pi / 2) ** torch.arange(1, slopes.shape[1] + 1).to(vectors)
             found["coefficients"] = torch.cat((-(slopes * powers).sum(1, keepdim=True), slopes), 1)
         return found | {"image_size": self.image_size}
 
     def lens(self, vector: Tensor) -> Lens | None:
         """The lens up to its limit; None if there is none."""
         try:
-            return self.model(**self.tensors(vector))
+            return self.model(**self.tensors(vector[None]))
         except ValueError:
             return None
 
-    def at(self, vector: Tensor, theta_max: Tensor) -> Lens:
-        """The lens without checks; differentiable."""
-        return self.model._from_tensors(self.tensors(vector) | {"theta_max": theta_max})
+    def at(self, vectors: Tensor, theta_max: Tensor) -> Lens:
+        """The lenses of vectors (B, n), without checks; differentiable."""
+        limits = {"theta_max": theta_max.expand(len(vectors))}
+        return self.model._from_tensors(self.tensors(vectors) | limits)
 
     def held(self, vector: Tensor, side: Tensor) -> Tensor:
         """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""
@@ -86,7 +88,8 @@ def pixels_of(lens: Lens, points: Tensor) -> Tensor:
     """(..., 2) px: where points (..., 3) are seen; those beyond θ_max as if at θ_max, so that no
     corner is lost while the lens changes."""
     aside = length_of(points[..., :2])
-    theta = torch.minimum(torch.atan2(aside, points[..., 2]), lens.theta_max)
+    limit = lens._row(lens.theta_max, aside.dim())
+    theta = torch.minimum(torch.atan2(aside, points[..., 2]), limit)
     return lens.pixels(theta, points[..., :2] / aside[..., None])
 
 
@@ -132,16 +135,11 @@ class Views(NamedTuple):
         vector of each pose in the camera's frame, and by its translation; 0 where not seen."""
         points, count = self.points(state), len(state.vector)
 
-        def along(way: Tensor) -> Tensor:
-            tangents = way[:count], way[count:].expand_as(points)
-            return torch.func.jvp(
-                lambda vector, points: pixels_of(free.at(vector, state.lens.theta_max), points),
-                (state.vector, points),
-                tangents,
-            )[1]
+        def places(numbers: Tensor) -> Tensor:
+            lens = free.at(numbers[:, :count], state.lens.theta_max)
+            return pixels_of(lens, points + numbers[:, None, None, count:])
 
-        ways = torch.eye(count + 3).to(points)
-        slopes = torch.func.vmap(along, out_dims=-1)(ways)
+        slopes = slopes_of(places, torch.cat((state.vector, state.vector.new_zeros(3))))
         there = self.seen & slopes.isfinite().flatten(2).all(-1)
         slopes = torch.where(there[..., None, None], slopes, 0.0)
         by_point = slopes[..., count:]
@@ -214,31 +212,34 @@ def _inverse(matrix: Tensor) -> Tensor:
     return (vectors / values[..., None, :]) @ vectors.mT
 
 
-def refine(views: Views, free: Free, state: State, lens_moves: bool = True) -> tuple[State, float]:
-    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss."""
-    miss = views.miss(state)
-    damping, scale, fine, still = 1e-3, math.inf, False, 0
-    for _ in range(ROUNDS):
-        distance = miss.norm(dim=-1)[views.seen]
-        part, typical = (0.5, MEDIAN) if fine else (0.97, MOST)
-        scale = max(min(scale, SCALE * distance.quantile(part).item() / typical), FINEST)
-        before = cost = losses(miss, scale).sum().item()
-        slopes, weights = views.slopes(free, state), weights_of(miss, scale)
-        normal = Normal(slopes, miss, weights, free, state.vector, lens_moves)
-        while damping < 1e10:
-            trial = state.moved(free, normal.damped(damping).steps(), lens_moves)
-            if trial is not None:
-                trial_miss = views.miss(trial)
-                cost = losses(trial_miss, scale).sum().item()
-                if cost < before:
-                    state, miss, damping = trial, trial_miss, max(damping / 10, 1e-12)
-                    break
-            damping *= 10
-        still = still + 1 if cost > (1 - (1e-5 if fine else 1e-3)) * before else 0
-        if damping >= 1e10 or still >= 2:
-            if fine:
+def refine(
+    views: Views, free: Free, state: State, lens_moves: bool = True, rough: bool = False
+) -> tuple[State, float]:
+    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss.
+
+    The scale follows the worst corners first; then, unless `rough`, the typical ones."""
+    sigma = math.inf
+    for part, typical, least_gain in ((0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5))[: 2 - rough]:
+        miss, damping, still = views.miss(state), 1e-3, 0
+        for _ in range(ROUNDS):
+            distance = miss.norm(dim=-1)[views.seen].quantile(part).item()
+            sigma = min(sigma, distance / typical)
+            scale = SCALE * max(sigma, SHARPEST)
+            before = cost = losses(miss, scale).sum().item()
+            slopes, weights = views.slopes(free, state), weights_of(miss, scale)
+            normal = Normal(slopes, miss, weights, free, state.vector, lens_moves)
+            while damping < 1e10:
+                trial = state.moved(free, normal.damped(damping).steps(), lens_moves)
+                if trial is not None:
+                    trial_miss = views.miss(trial)
+                    cost = losses(trial_miss, scale).sum().item()
+                    if cost < before:
+                        state, miss, damping = trial, trial_miss, max(damping / 10, 1e-12)
+                        break
+                damping *= 10
+            still = still + 1 if cost > (1 - least_gain) * before else 0
+            if damping >= 1e10 or still >= 2:
                 break
-            fine, damping, still = True, 1e-4, 0
     return state, scale
 
 

@@ -30,7 +30,7 @@ DICTIONARIES = {"charuco": "4X4_250", "april": "APRILTAG_36h11"}
 def calibrate(
     pictures: Sequence[str] = (), *, board: str, square: float, kind: Kind = "chessboard",
     marker: float | None = None, gap: float | None = None, dictionary: str | None = None,
-    model: str = "KannalaBrandt", out: str = "camera.json", picture: str | None = None,
+    model: str = "auto", out: str = "camera.json", picture: str | None = None,
     report: str | None = None, format: Format | None = None,
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
@@ -48,8 +48,8 @@ def calibrate(
         gap: the gap between AprilTags, in the same unit.
         dictionary: the markers, as OpenCV names them. The default is 4X4_250 for ChArUco boards and
             APRILTAG_36h11 for AprilTags.
-        model: the lens model, a name of darswin.lens.MODELS; or auto for the one that predicts
-            left-out pictures best.
+        model: the lens model, a name of darswin.lens.MODELS; or auto for the one of many that
+            predicts left-out pictures best.
         out: the calibration to write.
         picture: a figure to write: the corners, what they miss, how sure the lens is.
         report: a JSON file to write with all that was found.

@@ -2,11 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.curves import Tabulated, as_curves, cat
@@ -131,11 +132,21 @@ class Packing:
         """The numbers of the tensors, one after the other."""
         return torch.cat([tensors[name].flatten() for name in self.shapes])
 
-    def tensors(self, vector: Tensor) -> dict[str, Tensor]:
-        """The inverse of `vector`."""
-        pieces = vector.split([shape.numel() for shape in self.shapes.values()])
+    def tensors(self, vectors: Tensor) -> dict[str, Tensor]:
+        """The inverse of `vector`, for vectors (B, n) of B lenses."""
+        pieces = vectors.split([shape.numel() for shape in self.shapes.values()], dim=1)
         named = zip(self.shapes.items(), pieces, strict=True)
-        return {name: piece.reshape(shape) for (name, shape), piece in named}
+        return {name: piece.reshape(-1, *shape[1:]) for (name, shape), piece in named}
+
+
+def slopes_of(function: Callable[[Tensor], Tensor], vector: Tensor) -> Tensor:
+    """(..., n): the derivatives of a function by the numbers of a vector (n,). The function takes
+    vectors (n, n), one for each derivative, and gives (n, ...)."""
+    count = len(vector)
+    with forward_ad.dual_level():  # torch.func.jacfwd takes much longer
+        axes = torch.eye(count, dtype=vector.dtype)
+        values = function(forward_ad.make_dual(vector.repeat(count, 1), axes))
+        return forward_ad.unpack_dual(values).tangent.movedim(0, -1)
 
 
 def _least_squares(
@@ -152,14 +163,15 @@ def _least_squares(
     packing = Packing(model, start)
     low, high = packing.low, packing.high
 
-    def lens_of(vector: Tensor) -> Lens:
-        return model._from_tensors(packing.tensors(vector) | {"theta_max": theta_max})
+    def lenses_of(vectors: Tensor) -> Lens:
+        limits = {"theta_max": theta_max.expand(len(vectors))}
+        return model._from_tensors(packing.tensors(vectors) | limits)
 
-    def miss(vector: Tensor) -> Tensor:
-        return (lens_of(vector)._flat(theta, direction) - goal).flatten()
+    def places(vectors: Tensor) -> Tensor:
+        return lenses_of(vectors)._flat(theta, direction)
 
     def cost_of(vector: Tensor) -> float:
-        lens = lens_of(vector)
+        lens = lenses_of(vector[None])
         rises = bool((lens.project(theta).flatten().diff() > 0).all())
         value = (lens._flat(theta, direction) - goal).square().mean().item()
         return value if rises and value >= 0 else math.inf
@@ -167,10 +179,11 @@ def _least_squares(
     vector = packing.vector(start).clamp(low, high)
     cost, damping = cost_of(vector), 1e-3
     if not math.isfinite(cost):
-        return lens_of(vector), math.inf
+        return lenses_of(vector[None]), math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
     for _ in range(rounds):
-        error, slopes = miss(vector), torch.func.jacfwd(miss)(vector)
+        error = (places(vector[None]) - goal).flatten()
+        slopes = slopes_of(places, vector).flatten(0, -2)
         scale = slopes.norm(dim=0).clamp(min=1e-30)
         before = cost
         while damping < 1e12:
@@ -185,4 +198,4 @@ def _least_squares(
             damping *= 10
         if cost > 0.9999 * before or cost < 1e-26:
             break
-    return lens_of(vector), cost
+    return lenses_of(vector[None]), cost

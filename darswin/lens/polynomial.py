@@ -12,9 +12,10 @@ from darswin.lens.solve import inverse, rising_limit
 
 def horner(x: Tensor, coefficients: Tensor) -> Tensor:
     """c₀ + c₁ x + c₂ x² + …, for coefficients (N, n) and x (N or 1, ...)."""
-    value = torch.zeros_like(x)
-    for column in reversed(coefficients.unbind(1)):
-        value = value * x + Lens._row(column, x.dim())
+    rows = [Lens._row(column, x.dim()) for column in coefficients.unbind(1)]
+    value, _ = torch.broadcast_tensors(rows.pop() if rows else torch.zeros_like(x), x)
+    for row in reversed(rows):
+        value = value * x + row
     return value
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from darswin.ops._library import transformed
 from darswin.ops.checks import readable
@@ -23,7 +24,7 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     inverse, to `value` and to the tensors that `function` and `slope` use: each step doubles the
     order of the error, so derivatives up to the third are exact.
     """
-    with torch.no_grad():
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
         eager = readable(value) and not transformed()
         low, high, x = _brackets(function, value, end, eager)
         eps = torch.finfo(x.dtype).eps
@@ -63,26 +64,26 @@ def _brackets(
     return x0.view_as(high), x1.view_as(high), guess.view_as(high)
 
 
-@torch.no_grad()
 def rising_limit(slope: Function, end: Tensor) -> Tensor:
     """The first x, (N,), at which a slope is not positive or overflows; `end`, (N,), if there is
-    none among 1024 steps from 0 to `end`."""
+    none among 1024 steps from 0 to `end`. It has no derivatives."""
 
     def rises(x: Tensor) -> Tensor:
         value = slope(x)
         return (value > 0) & (value < torch.inf)
 
-    x = end[:, None] * torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
-    falls = ~rises(x)
-    if readable(falls) and not falls.any():
-        return end  # the usual case
-    first = falls.int().argmax(1, keepdim=True)
-    low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
-    for _ in range(50):
-        middle = (low + high) / 2
-        rising = rises(middle)
-        low, high = torch.where(rising, middle, low), torch.where(rising, high, middle)
-    return torch.where(falls.any(1), low[:, 0], end)
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+        x = end[:, None] * torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
+        falls = ~rises(x)
+        if readable(falls) and not falls.any():
+            return end  # the usual case
+        first = falls.int().argmax(1, keepdim=True)
+        low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
+        for _ in range(50):
+            middle = (low + high) / 2
+            rising = rises(middle)
+            low, high = torch.where(rising, middle, low), torch.where(rising, high, middle)
+        return torch.where(falls.any(1), low[:, 0], end)
 
 
 def newton(

@@ -194,6 +194,36 @@ def test_the_best_model_predicts_left_out_pictures(usual):
     assert ray_errors(found.lens, usual.lens, best=True).median() < 0.04
 
 
+@pytest.mark.parametrize(
+    ("model", "seed", "best"), [("OCamInverse", 29, "Polynomial"), ("EnhancedUnified", 3, None)]
+)
+def test_many_models_find_a_lens_that_one_cannot_show(model, seed, best):
+    true = rig(true_lens(model, 250, seed=seed), 20, noise=0.2, seed=seed, least=54)
+    found = of(true, "auto")
+    assert found.models[0][0] == (best or model)
+    one, many = (ray_errors(f.lens, true.lens, best=True).median() for f in (of(true), found))
+    assert many < 0.02 < 0.05 < one
+
+
+def stretched(found, ratio):
+    """The corners in pictures whose height was changed by a ratio."""
+    corners = found.corners.clone()
+    corners[..., 1] = (corners[..., 1] - 480) * ratio + 480
+    outside = ((corners[..., 1] < 0) | (corners[..., 1] > 959))[..., None]
+    return found._replace(corners=torch.where(outside, torch.nan, corners))
+
+
+@pytest.mark.parametrize("model", ["KannalaBrandt", "Mei", "Perspective"])
+def test_pixels_that_are_not_square_are_doubted(model):
+    true = rig(true_lens(model, 100, seed=3), 12, noise=0.2, seed=3)
+    for ratio, words in ((1.05, "% longer than"), (0.95, "% shorter than"), (1.0, None)):
+        seen = stretched(true, ratio)
+        doubts = [text for text in of(seen, model).doubts if "lengths along y" in text]
+        assert len(doubts) == (words is not None) and (not doubts or words in doubts[0])
+        found = of(seen, model, square_pixels=False)
+        assert not [text for text in found.doubts if "lengths along y" in text]
+
+
 def test_left_out_is_the_error_of_pictures_that_were_left_out():
     true = rig(true_lens("KannalaBrandt", 180), 6, noise=0.5)
     found = of(true)
@@ -273,3 +303,11 @@ def test_a_wrong_model_ends_in_words(usual):
         CalibrationError, match=r"The corners reach 9\d° from the axis, but a Persp"
     ):
         of(usual, "Perspective")
+
+
+def test_a_wrong_model_makes_no_outlier_count(usual):
+    corners = usual.corners.clone()
+    corners[3, 10] += 4.0
+    found = of(usual._replace(corners=corners), "auto")
+    assert found.left_out == pytest.approx(of(usual).left_out, rel=0.05)
+    assert found.doubts[0].startswith("corner 11 of picture 4 is ")

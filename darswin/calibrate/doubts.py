@@ -1,0 +1,88 @@
+"""What looks wrong with a calibration."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from darswin.calibrate.calibration import Calibration
+from darswin.calibrate.inputs import LEAST_CORNERS, CalibrationError
+from darswin.calibrate.refine import MEDIAN, OFF, SHARPEST
+
+UNSURE, UNKNOWN = 0.01, 0.2  # the radius's standard deviation, as a part of it
+FEW, BLURRED, PARALLEL = 8, 1.0, 12.0  # pictures; px; degrees
+WRONG = 0.02  # of the picture's side: a corner's standard deviation
+STRETCHED = 0.003  # of a pixel's side
+ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
+COVERED = 0.8  # of theta_max
+SHOWN = 10  # corners
+
+
+def doubts(found: Calibration, seen: Tensor, middle: Tensor, stretch: float) -> list[str]:
+    """What looks wrong, in sentences; seen: (P, K); middle: (3,), of the board's points; stretch:
+    how much longer than in x things seem in y, as a part of their length.
+
+    Raises:
+        CalibrationError: the pictures do not determine the lens.
+    """
+    said, used = [], found.used
+    rotations = found.rotations[used]
+    middles = rotations @ middle + found.translations[used]
+    if found.sigma > WRONG * found.lens.image_size.mean():
+        raise CalibrationError(
+            f"Half of the corners are {MEDIAN * found.sigma:.3g} px or more off the best lens: are "
+            "the board and the order of its corners right?"
+        )
+    theta = torch.linspace(0.3, 1, 8, dtype=torch.float64) * found.supported
+    spread = (found.uncertainty_of_theta(theta) / found.lens.project(theta)).max().item()
+    spread *= max(1.0, SHARPEST / max(found.sigma, 1e-12))
+    if not spread <= UNSURE:
+        tilt = torch.acos(rotations[:, 2, 2].abs().clamp(max=1)).max().rad2deg()
+        why = "take more pictures, with tilted boards that fill more of the picture"
+        if tilt < PARALLEL:
+            why = "all boards are nearly parallel to the sensor: tilt them by 20 to 45°"
+        if not spread <= UNKNOWN:
+            raise CalibrationError(f"The pictures do not determine the lens: {why}.")
+        said.append(f"the radius is unsure by {100 * spread:.2g} %: {why}")
+    distance = found.residuals.norm(dim=-1)
+    off = (distance > OFF * max(found.sigma, SHARPEST)) & used[:, None]
+    worst = sorted(((distance[k, i].item(), k, i) for k, i in off.nonzero().tolist()), reverse=True)
+    for d, k, i in worst[:SHOWN]:
+        said.append(f"corner {i + 1} of {found.names[k]} is {d:.3g} px off")
+    if len(worst) > SHOWN:
+        said.append(
+            f"{len(worst) - SHOWN} more corners are off, in {int(off.any(1).sum())} pictures"
+        )
+    for k in (~used).nonzero()[:, 0].tolist():
+        what = f"does not fit: half of its corners are {distance[k].nanmedian():.3g} px off"
+        if found.rotations[k].isnan().any():
+            count = int(seen[k].sum())
+            what = f"shows {count} corners; {LEAST_CORNERS}, not on one line, are needed"
+        said.append(f"{found.names[k]} {what}")
+    if used.sum() < FEW:
+        said.append(f"{int(used.sum())} pictures are few: take 10 to 20")
+    if found.sigma > BLURRED:
+        said.append(
+            f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
+            "or another model fits better"
+        )
+    if abs(stretch) > STRETCHED:
+        longer = "longer" if stretch > 0 else "shorter"
+        said.append(
+            f"lengths along y seem {100 * abs(stretch):.2g} % {longer} than along x: take pictures "
+            "that were not resized, or find the ratio with square_pixels=False"
+        )
+    far = middles.norm(dim=1)
+    if far.max() < ONE_DISTANCE * far.min():
+        said.append("all boards are at one distance: take some nearer and some farther")
+    behind = used.nonzero()[(rotations[:, :, 2] * middles).sum(1) < 0, 0].tolist()
+    if behind:
+        which = ", ".join(found.names[k] for k in behind[:SHOWN])
+        said.append(f"the board is mirrored, or seen from behind, in {len(behind)}: {which}")
+    end = found.lens.theta_max.item()
+    if found.supported < COVERED * end:
+        said.append(
+            f"corners reach {math.degrees(found.supported):.0f}° from the axis, but the sensor "
+            f"{math.degrees(end):.0f}°: in between, the lens is a guess"
+        )
+    return said
