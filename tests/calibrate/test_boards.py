@@ -204,7 +204,7 @@ def test_true_corners_are_never_wrong(fov):
 
 def test_points_are_in_the_unit_of_the_square():
     expected = [[0, 0], [2, 0], [4, 0], [0, 2], [2, 2], [4, 2]]
-    np.testing.assert_array_equal(Board.chessboard(3, 2, 2.0).points, expected)
+    np.testing.assert_array_equal(Board.chessboard(3, 3, 2.0).points[:6], expected)
     np.testing.assert_array_equal(Board.charuco(4, 3, 2.0, 1.0).points, expected)
     grid = Board.april_grid(2, 1, 2.0, 0.5).points
     x = [0, 2, 2.5, 4.5]
@@ -214,7 +214,7 @@ def test_points_are_in_the_unit_of_the_square():
 @pytest.mark.parametrize(
     ("make", "error", "said"),
     [
-        (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 2 to 100, got 1"),
+        (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 3 to 100, got 1"),
         (lambda: Board.chessboard(9, 6.0, 0.1), TypeError, "`rows` must be a whole number"),
         (lambda: Board.chessboard(9, 6, 0.0), ValueError, "`square` must be positive, got 0"),
         (lambda: Board.chessboard(9, 6, math.nan), ValueError, "`square` must be positive"),

@@ -151,8 +151,8 @@ def test_mirrored_pictures_are_told(folder, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--board=9", "--square=1"], "--board must be columns and rows from 2 to 100, such as"),
-        (["--board=1x6", "--square=1"], "--board must be columns and rows from 2 to 100"),
+        (["--board=9", "--square=1"], "--board must be columns and rows from 3 to 100, such as"),
+        (["--board=1x6", "--square=1"], "--board must be columns and rows from 3 to 100"),
         (["--board=9x6", "--square=0"], "--square must be positive, got 0"),
         (["--board=9x6", "--square=.nan"], "--square must be"),
         (["--board=9x6"], "--square"),
