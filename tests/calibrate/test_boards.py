@@ -107,6 +107,17 @@ def test_grids_of_kalibr_are_read(upside_down):
     np.testing.assert_allclose(find_corners(picture, board), true, atol=0.5)
 
 
+@pytest.mark.parametrize("rows", [5, 6])
+@pytest.mark.parametrize("white_first", [False, True])
+def test_charuco_boards_may_begin_with_a_white_square(rows, white_first):
+    drawn = cv2.aruco.CharucoBoard((7, rows), 1.0, 0.7, cv2.aruco.getPredefinedDictionary(2))
+    drawn.setLegacyPattern(white_first)
+    picture = cv2.GaussianBlur(drawn.generateImage((420, 60 * rows)), (0, 0), 0.7)
+    picture = cv2.copyMakeBorder(picture, 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    board = Board.charuco(7, rows, 60.0, 42.0)
+    np.testing.assert_allclose(find_corners(picture, board), board.points + 89.5, atol=0.5)
+
+
 @pytest.fixture(scope="module")
 def one() -> tuple[Renderer, Pose, np.ndarray]:
     view, rng = camera(150, (360, 360)), np.random.default_rng(1)
