@@ -207,9 +207,11 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
             places = (image.shape[1] - 1, 0) + places * (-1, 1)
         corners[name] = places
     if without:
-        instead = Counter(filter(None, without.values())).most_common(1)
         doubts.append(f"no board found in {_listed(without)}")
-        doubts[-1] += f": they show {instead[0][0]}" if instead else ""
+        # Single pictures may show other things, or a part of the board.
+        ((instead, count),) = Counter([*without.values()][:TRIED]).most_common(1)
+        if instead and 2 * count > min(len(without), TRIED):
+            doubts[-1] += f": they show {instead}"
     least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values(), 0])))
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")

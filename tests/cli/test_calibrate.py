@@ -28,7 +28,7 @@ CHARUCO = (*BOARD, "--kind", "charuco", "--marker", "0.022")
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Pictures of a chessboard, boards/0.png to 8.png, and of a ChArUco board, markers/0.png to 3.png."""
+    """Pictures of a chessboard, boards/0.png to 8.png, and of a ChArUco board, markers/."""
     folder = tmp_path_factory.mktemp("rendered")
     view, rng = Renderer(TRUE, samples=2), np.random.default_rng(0)
     for name, board, count in (
