@@ -208,9 +208,11 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
         corners[name] = places
     if without:
         doubts.append(f"no board found in {_listed(without)}")
-        # Single pictures may show other things, or a part of the board.
-        ((instead, count),) = Counter([*without.values()][:TRIED]).most_common(1)
-        if instead and 2 * count > min(len(without), TRIED):
+        tried = [*without.values()][:TRIED]
+        counts = Counter(filter(None, tried)).items()
+        instead, count = max(counts, key=lambda item: item[::-1], default=("", 0))
+        # Beside pictures with the board, single others may show a part of it.
+        if instead and (not corners or 2 * count > len(tried)):
             doubts[-1] += f": they show {instead}"
     least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values(), 0])))
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
