@@ -15,7 +15,6 @@ from darswin.utils.parameters import check
 Kind = Literal["chessboard", "charuco", "april"]
 
 SIDE = 1200  # px, to which larger pictures are reduced at first
-LEAST = 8  # corners, of which a pose follows safely
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
@@ -90,7 +89,7 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
 
     Returns:
         (K, 2) px, float64, in the order of `board.points`; NaN where a corner was not found. All
-        are NaN if the picture shows fewer than 8 corners, or corners in a wrong order.
+        are NaN if the picture does not show the board, or shows its corners in a wrong order.
     """
     if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8:
         raise TypeError("a picture must be an array of uint8")
@@ -100,7 +99,7 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
     find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
     for grid in find(grey, board) if grey.size else ():
         grid = _refined(grey, grid, board)
-        least = max(2 * LEAST, 0.9 * np.isfinite(grid).sum())
+        least = max(8, 0.9 * np.isfinite(grid).sum())
         # Markers tell each corner, so single wrong ones can be left out.
         while (odd := wrong(grid, board)).any() and board.kind != "chessboard":
             grid[odd == odd.max()] = np.nan
