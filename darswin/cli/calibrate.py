@@ -211,8 +211,8 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
         tried = [*without.values()][:TRIED]
         counts = Counter(filter(None, tried)).items()
         instead, count = max(counts, key=lambda item: item[::-1], default=("", 0))
-        # Beside pictures with the board, single others may show a part of it.
-        if instead and (not corners or 2 * count > len(tried)):
+        # Beside pictures with the board, others may show a part of it.
+        if instead and (len(corners) < LEAST or 2 * count > len(tried)):
             doubts[-1] += f": they show {instead}"
     least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values(), 0])))
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
