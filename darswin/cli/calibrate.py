@@ -214,7 +214,7 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
         # Beside pictures with the board, others may show a part of it.
         if instead and (len(corners) < LEAST or 2 * count > len(tried)):
             doubts[-1] += f": they show {instead}"
-    least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values(), 0])))
+    least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values()] or [0])))
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
     found = np.array([*corners.values()])
