@@ -119,14 +119,12 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         return "" if known else f"{columns}x{rows} inner corners"
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
-    numbers = {board.dictionary: np.empty(0, int)}
-    for name in (board.dictionary, *_names()):
-        found = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(grey)[1]
-        numbers[name] = np.empty(0, int) if found is None else found
-    name = max(numbers, key=lambda name: numbers[name].size)
-    if numbers[name].size < 4:
-        return ""
-    return f"markers {numbers[name].min()} to {numbers[name].max()} of {name}"
+    found = {}
+    for name in sorted(_names(), key=lambda name: name != board.dictionary):
+        numbers = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(grey)[1]
+        found[name] = [] if numbers is None else numbers.ravel().tolist()
+    name, seen = max(found.items(), key=lambda item: len(item[1]))
+    return f"markers {min(seen)} to {max(seen)} of {name}" if len(seen) > 3 else ""
 
 
 def wrong(grid: np.ndarray, board: Board) -> np.ndarray:
@@ -223,13 +221,10 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
 def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """(rows, columns): True if two opposite squares at a corner are darker than the others."""
     across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
-
-    def light(aside: np.ndarray) -> np.ndarray:
-        x, y = np.moveaxis((grid + aside).astype(np.float32), 2, 0)
-        return cv2.remap(grey, x, y, cv2.INTER_LINEAR)
-
     both, other = across + down, across - down
-    a, b, c, d = light(both), light(-both), light(other), light(-other)
+    places = np.array([grid + aside for aside in (both, -both, other, -other)], np.float32)
+    x, y = places.reshape(4, -1, 2).transpose(2, 0, 1)
+    a, b, c, d = cv2.remap(grey, x, y, cv2.INTER_LINEAR).reshape(4, *grid.shape[:2])
     return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))
 
 
