@@ -12,6 +12,7 @@ from darswin.calibrate.refine import MEDIAN, OFF, SHARPEST
 UNSURE, UNKNOWN = 0.01, 0.2  # the radius's standard deviation, as a part of it
 FEW, BLURRED, PARALLEL = 8, 1.0, 12.0  # pictures; px; degrees
 WRONG = 0.02  # of the picture's side: a corner's standard deviation
+GUESSED = 4.0  # left_out, by the standard deviation; 1.5 is usual
 STRETCHED = 0.003  # of a pixel's side
 ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
 COVERED = 0.8  # of theta_max
@@ -61,6 +62,11 @@ def doubts(found: Calibration, seen: Tensor, middle: Tensor, stretch: float) -> 
         said.append(f"{found.names[k]} {what}")
     if used.sum() < FEW:
         said.append(f"{int(used.sum())} pictures are few: take 10 to 20")
+    if found.left_out > GUESSED * max(found.sigma, SHARPEST):
+        said.append(
+            f"pictures that were left out are missed by {found.left_out:.3g} px, but the noise is "
+            f"{found.sigma:.2g} px: take more pictures"
+        )
     if found.sigma > BLURRED:
         said.append(
             f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "

@@ -9,7 +9,9 @@ Source: Devernay and Faugeras, MVA 2001; Coughlan and Yuille, ICCV 1999.
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -25,12 +27,20 @@ from darswin.utils.parameters import check
 
 MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
 STEP = 4  # points of an edge that are averaged
+FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
+TOLERANCE = 0.3, 1 / 800  # px, at least, and of the radius: by which a line misses
+STRAIGHT = 3.0  # times TOLERANCE: curves that miss by more are not lines
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
-BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.12, 4, 40)  # a₁ and h₀ that are tried
-AS_GOOD = 1.1  # times the least cost: other answers that the pictures allow
+BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
+LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
+USUAL = 10.0  # the weight of what usual lenses are like
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
-UNSURE, OFF, COVERED = 0.05, 2.0, 0.8  # of the rim's angle; px; of the radius
+UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
+SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
+
+
+_cost = attrgetter("cost")
 
 
 @dataclass(frozen=True)
@@ -40,8 +50,7 @@ class Estimate:
     Attributes:
         lens: one lens in float64.
         rim: rad, its θ at `radius`, px: at the image circle, or at the nearest side without one.
-        interval: rad: the least and the largest θ at the rim that the pictures allow, one standard
-            deviation around all answers that are nearly as good.
+        interval: rad: the least and the largest θ at the rim, one standard deviation around it.
         curves: the number of curves that are straight with this lens.
         covered: the part of the radius, in [0, 1], on which they lie.
         verdict: what supports the lens, in one sentence; doubts: sentences on what does not.
@@ -62,13 +71,10 @@ class Estimate:
 
 
 def estimate(
-    pictures: Sequence[np.ndarray],
-    model: str = "Spherical",
-    *,
-    center: tuple[float, float] | None = None,
-    fov: float | None = None,
+    pictures: Sequence[np.ndarray], model: str = "Spherical", *,
+    center: tuple[float, float] | None = None, fov: float | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """Finds the lens of a camera from pictures with straight edges.
 
     Args:
@@ -103,14 +109,10 @@ def estimate(
 
 
 def from_curves(
-    curves: Sequence[Sequence[np.ndarray]],
-    size: tuple[int, int],
-    model: str = "Spherical",
-    *,
-    center: tuple[float, float] | None = None,
-    fov: float | None = None,
+    curves: Sequence[Sequence[np.ndarray]], size: tuple[int, int], model: str = "Spherical", *,
+    center: tuple[float, float] | None = None, fov: float | None = None,
     circle: tuple[float, float, float] | None = None,
-) -> Estimate:
+) -> Estimate:  # fmt: skip
     """`estimate` from the curves of each picture, (n, 2) px; circle: (x, y, radius), px."""
     height, width = size
     x, y = center or (circle[:2] if circle else ((width - 1) / 2, (height - 1) / 2))
@@ -119,52 +121,56 @@ def from_curves(
     for number, of_picture in enumerate(curves):
         for curve in of_picture[:MOST]:
             points = curve[: len(curve) // STEP * STEP].reshape(-1, STEP, 2).mean(1)
+            # The edges of the image circle, and of a black frame, are not of the world.
             at_rim = circle and (np.hypot(*(points - circle[:2]).T) > 0.98 * radius).mean() > 0.1
-            if len(points) > 3 and not at_rim:
+            from_sides = np.hstack((points, (width - 1, height - 1) - points))
+            if len(points) > 3 and not at_rim and from_sides.max(0).min() > FRAME * radius:
                 pieces.append(points / radius)
                 picture.append(number)
-    about = 1e-4 if center else 0.01 if len(pieces) > ENOUGH and not circle else 0.002
+    about = 1e-4 if center else 0.001 if circle else 0.02 if len(pieces) > ENOUGH else 0.002
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
-    found = _search(_Lines(pieces, np.array(picture), radius, *known))
-    best = found[0]
-    oriented = best.oriented_pictures()
-    if fov is None and not oriented:
+    scale = min(radius / TOLERANCE[0], 1 / TOLERANCE[1])
+    best, *_ = found = _search(_Lines(pieces, np.array(picture), scale, *known))
+    along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
+    second = np.sort(along)[:, 1]
+    if fov is None and second.max() < SECOND[0]:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
             "in two orthogonal directions: give other pictures, or the image circle's field of view"
         )
-    raw, last = best.lens(size), best.rho.max()
+    raw, last = best.lens(size, radius), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
-        try:
+        with suppress(ValueError):
             lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
             break
-        except ValueError as reason:
-            if part == 0.8:
-                raise CalibrationError(
-                    f"no {model} lens is close to what the lines show: give more pictures, or "
-                    "try another model"
-                ) from reason
+    else:
+        raise CalibrationError(
+            f"no {model} lens is close to what the lines show: give more pictures, or another model"
+        )
     lens = lens.with_theta_max(None)
     rim = lens.unproject(min(radius, lens.r_max.item())).item()
     if rim < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigma, rims = 0.0 if fov else best.deviation(), [rim, *(f.rim for f in found)]
-    low, high = min(rims) - sigma, max(rims) + sigma
+    sigma = math.hypot(0.0 if fov else _deviation(found), rim - best.rim)
+    low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
+    oriented = (second >= SECOND[0]).sum()
     source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
     )
+    few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        "the pictures allow very different lenses: give more of them": high - low
-        > 2 * UNSURE * rim,
+        "the pictures allow very different lenses: give more of them": sigma > UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
+        f"only {second.max()} lines of a picture have a second direction": few,
+        f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
     }
     said = tuple(doubt for doubt, holds in doubts.items() if holds)
@@ -183,30 +189,33 @@ class _Lines:
     """The curves of all pictures, in radii of the image, and what is known of the lens.
 
     A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
-    at the distance ρ from the centre (x, y). center: (x, y, standard deviation); rim: θ at ρ = 1.
+    at the distance ρ from the centre (x, y). scale: of a radius, in units of TOLERANCE; center:
+    (x, y, standard deviation); rim: θ at ρ = 1; belief: (6,), is added to what is `unusual`.
     """
 
     def __init__(
         self, pieces: list[np.ndarray], picture: np.ndarray, scale: float, center: np.ndarray,
-        rim: float | None,
+        rim: float | None, belief: np.ndarray | float = 0.0,
     ):  # fmt: skip
         self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
-        self.rim, self.points = rim, np.concatenate(pieces)
+        self.rim, self.belief, self.points = rim, belief, np.concatenate(pieces)
         self.counts = np.array([len(piece) for piece in pieces])
         self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
 
-    def some(self, keep: np.ndarray) -> "_Lines":
+    def some(self, keep: np.ndarray, belief: np.ndarray | float = 0.0) -> "_Lines":
         kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
-        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim)
+        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, belief)
 
     def unusual(self, v: np.ndarray) -> np.ndarray:
         """How far a lens is from usual ones, and from what is known."""
         bend, about = abs(v[1]), (v[4:] - self.center[:2]) / self.center[2]
-        # Usual shapes are between those of stereographic and equidistant lenses.
+        # Usual shapes are between those of stereographic and equidistant lenses. The bend for the
+        # scale, -a₁ h₀², is 0 for perspective, 1/4 and 1/3 for these, 1/2 for orthographic lenses.
         second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
         third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
+        scale = -4 * v[1] * math.exp(2 * v[0]) - 1
         off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
-        return np.array((10 * second, 10 * third, *3 * about, off))
+        return np.array((USUAL * second, USUAL * third, USUAL * scale, *about, off)) + self.belief
 
 
 def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,15 +237,14 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 class _Seen:
     """What a lens v sees: the plane through the camera that is closest, in px, to each curve.
 
-    Attributes: miss: px, of the points; straightness: (C,) px², its mean square for each curve;
-    normal: (C, 3), of the planes. After `orient`, axes: three orthogonal directions (3, 3) of each
-    picture; apart: (C,), the root of the sum of squares, px, that the nearest direction adds to a
-    curve; nearest: (C,), its number; cost, and rows of the least-squares problem.
+    In units of TOLERANCE: miss, of the points; straightness: (C,), its mean square for each curve.
+    normal: (C, 3), of the planes, with the signs of `like`. After `orient`, axes: three orthogonal
+    directions (3, 3) of each picture; along: (C,), the number of a curve's direction, or -1; agree:
+    in [0, 1], how many have one; rows of the least-squares problem; cost.
     """
 
-    def __init__(self, lines: _Lines, v: np.ndarray, like: "_Seen | None" = None):
-        self.lines, self.v = lines, v
-        self.normal: np.ndarray
+    def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | float = 1.0):
+        self.lines, self.v, self.rim = lines, v, _rim(v)
         offset = lines.points - v[4:]
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
@@ -254,144 +262,139 @@ class _Seen:
             weight = 1 / ((normal * along).sum(1) ** 2 + (normal * across).sum(1) ** 2)
         self.miss = lines.scale * (normal * ray).sum(1) * np.sqrt(weight)
         self.straightness = np.add.reduceat(self.miss**2, starts) / lines.counts
-        if like is not None:  # a plane has two normals
-            sign = np.sign((self.own[:, :, 0] * like.normal).sum(1) + 1e-9)
-            self.own *= sign[:, None, None]
-            self.miss *= sign.repeat(lines.counts)
+        sign = np.sign((self.own[:, :, 0] * like).sum(1) + 1e-9)  # a plane has two normals
+        self.own *= sign[:, None, None]
+        self.miss *= sign.repeat(lines.counts)
         self.normal, self.spread = self.own[:, :, 0], np.maximum(spread[:, 1:], 1e-9)
 
-    @property
-    def rim(self) -> float:
-        return _rim(self.v)
-
     def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """`apart`, with a sign, of curves (K,) from directions (..., 3); (K, ...)."""
+        """How far, with a sign, curves (K,) are from directions (..., 3), as an array (K, ...)."""
         part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
         spread = self.spread[of].reshape(len(of), 2, *[1] * (directions.ndim - 1))
         return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
 
-    def best_axes(self, of: np.ndarray) -> tuple[float, np.ndarray]:
-        """The directions that suit the curves of a picture, and their cost, by trying those of
-        pairs of long curves."""
+    def nearest_of(self, axes: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`from_directions` and the number of the nearest of axes (3, 3) to each of curves (K,)."""
+        apart = self.from_directions(axes, of)
+        nearest = np.abs(apart).argmin(1)
+        return apart[np.arange(len(of)), nearest], nearest
+
+    def best_axes(self, of: np.ndarray) -> np.ndarray:
+        """The directions that suit the curves of a picture, of those of pairs of long curves."""
         counts = self.lines.counts[of]
-        normal = self.normal[of[np.argsort(-counts, kind="stable")[:11]]]
+        normal = self.normal[of[np.argsort(-counts, kind="stable")[:LONGEST]]]
         i, j = np.triu_indices(len(normal), 1)
         first = _unit(np.cross(normal[i], normal[j]))[:, None]
         second = _unit(np.cross(first, normal))
         first = np.broadcast_to(first, second.shape)
         axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
         apart = np.abs(self.from_directions(axes, of)).min(-1).T
-        cost = np.minimum(apart**2, counts).sum(1)
-        return cost.min(), axes[cost.argmin()]
+        likely = _robust(apart, counts).sum(1).argsort(kind="stable")[:LIKELY]
+        turned = [self.turned(axes[k], of) for k in likely]
+        return min(turned, key=lambda t: _robust(self.nearest_of(t, of)[0], counts).sum())
 
     def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Directions near `axes` that fit the curves of a picture better."""
         for _ in range(2):
-            all_ = self.from_directions(axes, of)
-            nearest = np.abs(all_).argmin(1)
-            apart, nearest = all_[np.arange(len(of)), nearest], axes[nearest]
-            sine = (self.normal[of] * nearest).sum(1)
+            apart, number = self.nearest_of(axes, of)
+            nearest, normal = axes[number], self.normal[of]
+            sine = (normal * nearest).sum(1)
             weight = apart / np.where(np.abs(sine) > 1e-12, sine, 1)
             weight /= 1 + apart**2 / self.lines.counts[of]
-            rows = weight[:, None] * np.cross(nearest, self.normal[of])
+            rows = weight[:, None] * np.cross(nearest, normal)
             turn = np.linalg.lstsq(rows, -weight * sine, rcond=1e-6)[0]
             turn /= max(1, 10 * np.linalg.norm(turn))
             u, _, vh = np.linalg.svd(axes + np.cross(turn, axes))
             axes = u @ vh
         return axes
 
-    def orient(self, axes: dict[int, np.ndarray], like: "_Seen | None" = None) -> "_Seen":
-        """Itself with all attributes, from directions nearby; `rows` have the weights of `like`."""
-        counts = self.lines.counts
-        self.axes = {p: self.turned(near, self.lines.of[p]) for p, near in axes.items()}
-        self.apart, self.nearest = np.zeros(len(counts)), np.full(len(counts), -1)
+    def orient(self, axes: dict[int, np.ndarray] | None = None) -> "_Seen":
+        """Itself with all attributes, from directions nearby or from the best."""
+        counts, of = self.lines.counts, self.lines.of
+        if axes is None:
+            axes = {p: self.best_axes(curves) for p, curves in of.items() if len(curves) > 2}
+        self.axes = {p: self.turned(near, of[p]) for p, near in axes.items() if p in of}
+        apart, self.along = np.zeros(len(counts)), np.full(len(counts), -1)
         for p, found in self.axes.items():
-            of = self.lines.of[p]
-            apart = self.from_directions(found, of)
-            self.nearest[of] = np.abs(apart).argmin(1)
-            self.apart[of] = apart[np.arange(len(of)), self.nearest[of]]
-        # A curve that misses its plane or its direction by more than 1 px counts little.
-        unusual, turned = self.lines.unusual(self.v), self.apart**2 / counts
-        bent, turned = (square / (1 + square) for square in (self.straightness, turned))
-        self.cost = (counts * (bent + ORTHOGONAL * turned)).sum() + (unusual**2).sum()
-        like = like or self
-        bends = (self.miss / (1 + like.straightness).repeat(counts)), unusual
-        turns = math.sqrt(ORTHOGONAL) * self.apart / (1 + like.apart**2 / counts)
-        self.rows = np.concatenate((*bends, turns))
+            apart[of[p]], self.along[of[p]] = self.nearest_of(found, of[p])
+        self.along[apart**2 > STRAIGHT**2 * counts] = -1
+        self.agree = 1 - _robust(apart, counts).sum() / counts.sum()
+        # A curve that misses its plane or its direction by more than TOLERANCE counts little.
+        bends = self.miss / np.sqrt(1 + self.straightness).repeat(counts)
+        turns = math.sqrt(ORTHOGONAL) * apart / np.sqrt(1 + apart**2 / counts)
+        self.rows = np.concatenate((bends, turns, self.lines.unusual(self.v)))
+        self.cost = self.rows @ self.rows
         return self
 
-    def refined(self, steps: int) -> "_Seen":
+    def moved(self, step: np.ndarray | float) -> "_Seen":
+        return _Seen(self.lines, self.v + step, self.normal).orient(self.axes)
+
+    def refined(self, steps: int = 30) -> "_Seen":
         """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
         found, damping = self, 1e-3
         for _ in range(steps):
-            best, before = found, found.cost
-
-            def at(v: np.ndarray, best: _Seen = best) -> _Seen:
-                return _Seen(best.lines, v, best).orient(best.axes, best)
-
-            rows = at(best.v).rows
-            moved = [at(best.v + step).rows - rows for step in 1e-5 * np.eye(6)]
-            slopes = np.stack(moved, 1) / 1e-5
+            best, rows = found, found.moved(0).rows
+            slopes = np.stack([best.moved(d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
             square, slope = slopes.T @ slopes, slopes.T @ rows
             while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = at(best.v - np.linalg.solve(damped, slope))
-                found = trial if trial.cost < before else best
+                trial = best.moved(-np.linalg.solve(damped, slope))
+                found = trial if trial.cost < best.cost else best
                 damping *= 10 if found is best else 0.1
-            if found.cost > (1 - 1e-4) * before:
+            if found.cost > (1 - 1e-4) * best.cost:
                 break
         return found
 
-    def oriented_pictures(self) -> int:
-        """The number of pictures with several lines in each of two orthogonal directions."""
-        along = np.where(self.apart**2 < self.lines.counts, self.nearest, -1)
-        return sum(
-            sum(int((along[of] == k).sum() > 2) for k in range(3)) > 1
-            for of in self.lines.of.values()
-        )
-
-    def deviation(self) -> float:
-        """The standard deviation of the rim, rad, by the jackknife over groups of curves."""
-        lines, of = self.lines, self.lines.picture
-        group = (of if len(lines.of) >= GROUPS else np.arange(len(of))) % GROUPS
-        depths = math.exp(self.v[0]) * np.geomspace(0.7, 1.4, 9)
-        rims = [_round(lines.some(group != k), self.v, depths)[0].rim for k in range(GROUPS)]
-        return math.sqrt((GROUPS - 1) * np.var(rims))
-
-    def lens(self, size: tuple[int, int]) -> OCam:
+    def lens(self, size: tuple[int, int], radius: float) -> OCam:
         """As a lens for pictures of (H, W)."""
-        scale, h, (a, b, c) = self.lines.scale, math.exp(self.v[0]), self.v[1:4]
-        numbers = [-h * scale, 0, -h * a / scale, 0, -h * b / scale**3, 0, -h * c / scale**5]
-        center = torch.from_numpy(scale * self.v[4:])
-        return OCam(torch.tensor(numbers, dtype=torch.float64), center=center, image_size=size)
+        h, (a, b, c) = math.exp(self.v[0]), self.v[1:4] / radius ** np.array((1, 3, 5))
+        numbers = torch.tensor([-h * radius, 0, -h * a, 0, -h * b, 0, -h * c], dtype=torch.float64)
+        return OCam(numbers, center=torch.from_numpy(radius * self.v[4:]), image_size=size)
+
+
+def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return apart**2 / (1 + apart**2 / counts)
 
 
 def _search(lines: _Lines) -> list[_Seen]:
-    """The lenses that fit nearly best, the best first."""
+    """The lenses that fit best, the best first."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
     shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
     tried = [_Seen(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
-    v = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum()).v
-    for _ in range(2):
-        straight = _Seen(lines, v).straightness < 1
-        _check(straight.sum())
-        fits = _round(lines.some(straight), v, DEPTHS)
-        v = fits[0].v
-    return [f for f in fits if f.cost <= AS_GOOD * fits[0].cost]
+    near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
+    shape = near.orient({}).refined()
+    straight = shape.straightness < STRAIGHT**2
+    _check(straight.sum())
+    lines, starts = lines.some(straight), []
+    for depth in DEPTHS:
+        starts.append(_Seen(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
+        if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
+            break
+    fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
+    if (known := lines.rim) is not None:
+        fits = [min(starts, key=lambda start: abs(start.rim - known))]
+    fits = sorted(fits, key=_cost)[:LOWS]
+    for _ in range(3):
+        fits = [fit.refined(5) for fit in fits]
+        fits = [min(fit, _Seen(lines, fit.v).orient(), key=_cost) for fit in fits]
+    least = min(map(_cost, fits))
+    return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)
 
 
-def _round(lines: _Lines, v: np.ndarray, depths: np.ndarray) -> list[_Seen]:
-    """The best lenses from a search with any of the depths, the best first."""
-    starts, costs = [], []
-    for depth in depths:
-        start = _Seen(lines, np.array((math.log(depth), *v[1:])))
-        found = {p: start.best_axes(of) for p, of in lines.of.items() if len(of) >= 3}
-        starts.append((start, {p: axes for p, (_, axes) in found.items()}))
-        costs.append(sum(cost for cost, _ in found.values()))
-    lows = [k for k in range(len(costs)) if costs[k] == min(costs[max(k - 2, 0) : k + 3])]
-    if lines.rim is not None:
-        lows = [int(np.argmin([abs(start.rim - lines.rim) for start, _ in starts]))]
-    lows = sorted(lows, key=lambda k: costs[k])[:3]
-    fits = [starts[k][0].orient(starts[k][1]).refined(5) for k in lows]
-    least = min(f.cost for f in fits)
-    return sorted((f.refined(30) for f in fits if f.cost < 1.3 * least), key=lambda f: f.cost)
+def _deviation(fits: list[_Seen]) -> float:
+    """The standard deviation of the rim, rad: by the jackknife over groups of neighbouring curves,
+    whose errors are alike, and by other beliefs on usual lenses and on the centre."""
+    lines, best = fits[0].lines, fits[0]
+
+    def rim(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> float:
+        some = lines.some(keep, belief)
+        return min((_Seen(some, f.v).orient(f.axes).refined(8) for f in fits), key=_cost).rim
+
+    x, y = np.array([piece.mean(0) for piece in lines.pieces]).T - best.v[4:, None]
+    group = np.empty(len(x), int)
+    group[np.lexsort((np.arctan2(y, x), lines.picture))] = np.arange(len(x)) * GROUPS // len(x)
+    without = [rim(group != k) for k in range(GROUPS)]
+    # How far lenses differ from `usual` ones and their centres from the middle.
+    beliefs = np.diag((0.5 * USUAL, 0.5 * USUAL, 0.4 * USUAL, 5, 5, 0))[:5]
+    changes = [rim(group >= 0, belief) - best.rim for belief in beliefs]
+    return math.sqrt((GROUPS - 1) * np.var(without) + np.square(changes).sum())

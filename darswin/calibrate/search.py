@@ -53,6 +53,7 @@ def calibrate(
     terms: int | None = None,
     names: Sequence[str] | None = None,
     square_pixels: bool = True,
+    accept: Callable[[Lens], bool] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Calibration:
     """Finds the lens of a camera from the corners of a board in its pictures.
@@ -70,6 +71,8 @@ def calibrate(
             default.
         names: those of the pictures, for messages. None means "picture 1", ….
         square_pixels: False also finds the ratio of a pixel's sides.
+        accept: a function of a lens: "auto" takes the best lens for which it is True, such as one
+            that a file format holds. If there is none, it takes the best of all.
         progress: a function that is called with lines of text.
 
     Raises:
@@ -109,7 +112,8 @@ def calibrate(
         one.judge(views, counts)
     found.sort(key=lambda one: one.left_out)
     table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
-    best, miss = found[0], found[0].miss
+    best = next((one for one in found if accept is None or accept(one.state.lens)), found[0])
+    miss = best.miss
     middle, unit = points.mean(0), (points - points.mean(0)).norm(dim=1).max()
     spot = torch.cat((middle, middle.new_zeros(1)))
     place = views.points(best.state)

@@ -78,6 +78,7 @@ COMMANDS = {
         "prints versions, CPU and extras, for bug reports", (), "darswin.cli.info:info"
     ),
 }
+STOPPED = 130  # the exit code after Ctrl-C, by convention
 HELP = Command("", (), "darswin.cli.main:print_help")
 # Replacements for terminals that can only show ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
@@ -108,6 +109,8 @@ def main(argv: list[str] | None = None) -> None:
         else:
             run_command(resolve_name(command.function), argv[1:], f"darswin {name}")
         sys.stdout.flush()
+    except KeyboardInterrupt:
+        raise SystemExit(STOPPED) from None
     except BrokenPipeError:  # `darswin lens info … | head` stops reading early
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, ImportError, FloatingPointError, MemoryError) as error:

@@ -311,3 +311,19 @@ def test_a_wrong_model_makes_no_outlier_count(usual):
     found = of(usual._replace(corners=corners), "auto")
     assert found.left_out == pytest.approx(of(usual).left_out, rel=0.05)
     assert found.doubts[0].startswith("corner 11 of picture 4 is ")
+
+
+def test_the_best_model_that_is_accepted_is_taken(usual):
+    table = [name for name, *_ in of(usual, "auto").models]
+    found = of(usual, "auto", accept=lambda lens: type(lens).__name__ == table[2])
+    assert [name for name, *_ in found.models] == table and type(found.lens).__name__ == table[2]
+    none = of(usual, "auto", accept=lambda lens: False)
+    assert type(none.lens).__name__ == table[0]
+
+
+@pytest.mark.parametrize(("pictures", "noise", "limit"), [(4, 2.0, 0.3), (4, 0.2, 1.6)])
+def test_left_out_pictures_that_are_missed_are_doubted(pictures, noise, limit):
+    lens = true_lens("KannalaBrandt", 190).with_theta_max(limit)
+    found = of(rig(lens, pictures, noise=noise, least=10))
+    doubted = [text for text in found.doubts if text.startswith("pictures that were left out")]
+    assert bool(doubted) == (found.left_out > 4 * found.sigma) == (noise == 2.0)

@@ -33,7 +33,9 @@ LENSES = {
 }
 
 
-def curves_of(lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, center=(0.0, 0.0)):
+def curves_of(
+    lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, first=0, center=(0.0, 0.0)
+):
     """Curves of a camera in a world of lines along `axes` orthogonal directions, with lines askew
     and curves that are not straight."""
     rng = np.random.default_rng(seed)
@@ -41,7 +43,7 @@ def curves_of(lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, c
     curves = []
     while len(curves) < straight + askew + bent:
         k = len(curves)
-        way = rotation[k % axes] if k < straight else rng.normal(size=3)
+        way = rotation[first + k % axes] if k < straight else rng.normal(size=3)
         way = way / np.linalg.norm(way)
         along = np.linspace(-6, 6, 3000)[:, None] * way
         if k >= straight + askew:  # an arc of a circle
@@ -63,6 +65,29 @@ def curves_of(lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, c
         even = np.stack([np.interp(places, steps, pixels[:, j]) for j in (0, 1)], 1)
         curves.append(even + rng.normal(0, noise, even.shape) + center)
     return sorted(curves, key=len, reverse=True)
+
+
+def board_of(lens, seed):
+    """The edges of the squares of a board, and edges in other directions, around it."""
+    rng, curves = np.random.default_rng(seed), []
+    turn = np.linalg.qr(np.eye(3) + 0.4 * rng.normal(size=(3, 3)))
+    rotation = turn[0] * np.sign(np.diag(turn[1]))
+    for k in range(200):
+        i, j = divmod(k % 100, 10)
+        start, step = ((i, j), (1, 0)) if k < 100 else ((i, j), (0, 1))
+        edge = np.linspace(start, np.add(start, step), 200)
+        points = (np.column_stack((edge, np.zeros(200))) - (5, 5, 0)) @ rotation.T + (0, 0, 14)
+        curves.append(points)
+    curves += [
+        rng.uniform((-9, -6, 14), (9, 6, 18))
+        + np.linspace(0, 0.6, 300)[:, None] * rng.normal(size=3)
+        for _ in range(30)
+    ]
+    pixels = [lens.project_points(torch.from_numpy(c)[None])[0].numpy() for c in curves]
+    seen = [p for p in pixels if (p > 0).all() and (p < np.array(SIZE[::-1]) - 1).all()]
+    lengths = [np.linalg.norm(p[-1] - p[0]) for p in seen]
+    short = [p[:: max(1, int(len(p) / n))] for p, n in zip(seen, lengths, strict=True) if n > 28]
+    return [p + rng.normal(0, 0.15, p.shape) for p in sorted(short, key=len, reverse=True)]
 
 
 def rim_of(lens, radius=240.0):
@@ -125,6 +150,65 @@ def test_the_centre_is_found_if_there_are_many_curves():
     torch.testing.assert_close(fixed.lens.center[0], f64(325.5, 235.5), atol=0.1, rtol=0)
 
 
+def test_edges_of_a_black_frame_are_no_lines():
+    lens, along, down = LENSES["spherical 0.3"], np.arange(630.0), np.arange(470.0)
+    curves = [curves_of(lens, seed, 15, bent=0) for seed in range(2)]
+    frame = [(along, 0 * along + 2), (along, 0 * along + 476), (0 * down + 4, down)]
+    framed = [[np.stack(side, 1) for side in frame] + of for of in curves]
+    assert from_curves(framed, SIZE).to_dict() == from_curves(curves, SIZE).to_dict()
+
+
+def test_larger_pictures_of_the_same_sharpness_give_the_same_lens():
+    curves = curves_of(LENSES["equidistant"], 1, 25)
+    large = [np.repeat(4 * curve + 1.5, 4, 0) for curve in curves]
+    found, same = from_curves([curves], SIZE), from_curves([large], (4 * SIZE[0], 4 * SIZE[1]))
+    assert same.rim == pytest.approx(found.rim, rel=0.01) and same.curves == found.curves
+    assert same.lens.focal.item() == pytest.approx(4 * found.lens.focal.item(), rel=0.02)
+
+
+def test_short_edges_of_a_board_in_many_poses_determine_a_narrow_lens():
+    """All lines of a picture are in one plane, and some edges behind it are in any direction."""
+    lens = lenses.BrownConrady(f64(540.0), radial=f64(-0.27, 0.04)[None], **F64)
+    curves = [board_of(lens, seed) for seed in range(4)]
+    found = from_curves(curves, SIZE, "KannalaBrandt")
+    assert found.rim == pytest.approx(rim_of(lens), rel=0.03) and found.doubts == ()
+
+
+def test_an_interval_holds_the_truth_in_two_cases_of_three():
+    misses = []
+    for seed in range(12):
+        lens = list(LENSES.values())[seed % 9]
+        center = np.random.default_rng(seed).uniform(-3, 3, 2)
+        low, high = from_curves([curves_of(lens, seed, noise=0.1, center=center)], SIZE).interval
+        misses.append(abs(rim_of(lens) - (low + high) / 2) / ((high - low) / 2))
+    assert sum(miss <= 1 for miss in misses) >= 8 and max(misses) < 3
+
+
+@pytest.mark.parametrize(
+    ("of_second", "askew", "doubt"),
+    [(15, 6, None), (4, 0, "only 4 lines of a picture have a second direction"),
+     (12, 80, "of the lines agree with orthogonal directions")],
+)  # fmt: skip
+def test_few_orthogonal_lines_are_a_doubt(of_second, askew, doubt):
+    lens = LENSES["equidistant"]
+    curves = curves_of(lens, 3, 15, axes=1, bent=0, askew=askew)
+    other = curves_of(lens, 3, of_second, axes=1, bent=0, askew=0, first=1)
+    said = " ".join(from_curves([curves + other], SIZE).doubts)
+    assert doubt in said if doubt else "direction" not in said
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_of_all_models_are_usual(name):
+    lens, rho = LENSES[name], np.linspace(0.05, 1, 30)
+    radius = min(240.0, lens.with_theta_max(None).r_max.item())
+    theta = lens.with_theta_max(None).unproject(torch.from_numpy(radius * rho)[None])[0].numpy()
+    powers = rho[:, None] ** (0, 2, 4, 6)
+    h, *bend = np.linalg.lstsq(powers, rho / np.tan(theta), rcond=None)[0]
+    v = np.array((math.log(h), *(np.array(bend) / h), 0, 0))
+    known = lines._Lines([np.zeros((1, 2))], np.zeros(1), 1.0, np.array((0, 0, 1)), None)
+    assert (abs(known.unusual(v)[:3]) < 1.5 * lines.USUAL).all()
+
+
 def test_too_little_evidence_is_refused_in_one_sentence():
     for curves in ([], [[]], [curves_of(LENSES["equidistant"], 1, 5, askew=0, bent=2)]):
         with pytest.raises(CalibrationError, match="curves may be straight lines, but") as error:
@@ -137,6 +221,12 @@ def test_no_lens_at_all_is_no_answer(monkeypatch):
     monkeypatch.setattr(lines, "NARROWEST", from_curves(curves, SIZE).rim + 0.1)
     with pytest.raises(CalibrationError, match="do not determine a lens"):
         from_curves(curves, SIZE)
+
+
+def test_an_interval_has_only_angles_of_lenses(monkeypatch):
+    monkeypatch.setattr(lines, "_deviation", lambda fits: 9.0)
+    found = from_curves([curves_of(LENSES["equisolid"], 1)], SIZE)
+    assert found.interval == (0.0, math.pi) and "very different lenses" in found.doubts[0]
 
 
 def test_an_estimate_is_the_same_bits_again():
