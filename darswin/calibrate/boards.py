@@ -1,7 +1,7 @@
 """Calibration boards, and their corners in pictures."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -13,7 +13,6 @@ from darswin.utils.nearest import did_you_mean
 from darswin.utils.parameters import check
 
 Kind = Literal["chessboard", "charuco", "april"]
-Found = tuple[Sequence[np.ndarray], np.ndarray | None]  # corners, and their numbers
 
 SIDE = 1200  # px, to which larger pictures are reduced at first
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
@@ -39,15 +38,15 @@ class Board:
     @classmethod
     def chessboard(cls, columns: int, rows: int, square: float) -> Self:
         """A chessboard with `columns` × `rows` inner corners."""
-        _check(columns, rows, 2, square=square)
+        _check(columns, rows, 3, square=square)
         return cls("chessboard", columns, rows, square)
 
     @classmethod
     def charuco(
         cls, columns: int, rows: int, square: float, marker: float, dictionary: str = "4X4_250"
     ) -> Self:
-        """A board of `columns` × `rows` squares, a black one at the upper left, with markers in the
-        white ones, as OpenCV draws it."""
+        """A board of `columns` × `rows` squares with markers in the white ones, as OpenCV draws it.
+        The square at the upper left is black, or white as in boards of OpenCV before 4.6."""
         _check(columns, rows, 3, square=square, marker=marker)
         check("marker", marker, marker < square, f"below the square of {square:g}")
         _dictionary(dictionary, columns * rows // 2)
@@ -96,64 +95,65 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
         raise TypeError("a picture must be an array of uint8")
     if picture.ndim not in (2, 3) or np.atleast_3d(picture).shape[2] not in (1, 3):
         raise ValueError(f"a picture must be (H, W), (H, W, 1) or (H, W, 3), got {picture.shape}")
-    grey = np.ascontiguousarray(with_channels(np.atleast_3d(picture), 1)[..., 0])
+    grey = _grey(picture)
     find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
-    for grid in find(grey, board):
-        grid = _refined(grey, grid, board) if np.isfinite(grid).any() else grid
-        least = 0.9 * np.isfinite(grid).sum()
+    for grid in find(grey, board) if grey.size else ():
+        grid = _refined(grey, grid, board)
+        least = max(8, 0.9 * np.isfinite(grid).sum())
         # Markers tell each corner, so single wrong ones can be left out.
         while (odd := wrong(grid, board)).any() and board.kind != "chessboard":
             grid[odd == odd.max()] = np.nan
-        if np.isfinite(grid).sum() >= max(8, least) and not odd.any():
+        if np.isfinite(grid).sum() >= least and not odd.any():
             return grid.reshape(-1, 2)
     return np.full(board.points.shape, np.nan)
 
 
+def shown_instead(picture: np.ndarray, board: Board) -> str:
+    """What a picture without the board shows in its place, in words; "" if nothing is known."""
+    grey, _ = next(_scales(_grey(picture)))
+    if board.kind == "chessboard":
+        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+        there, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+        rows, columns = sorted(meta.shape) if there else (3, 3)
+        known = {rows, columns} in ({3}, {board.columns, board.rows})
+        return "" if known else f"{columns}x{rows} inner corners"
+    if np.isfinite(find_corners(grey[:, ::-1], board)).any():
+        return "it mirrored, flip them first"
+    found = {}
+    for name in sorted(_names(), key=lambda name: name != board.dictionary):
+        numbers = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(grey)[1]
+        found[name] = [] if numbers is None else numbers.ravel().tolist()
+    name, seen = max(found.items(), key=lambda item: len(item[1]))
+    return f"markers {min(seen)} to {max(seen)} of {name}" if len(seen) > 3 else ""
+
+
 def wrong(grid: np.ndarray, board: Board) -> np.ndarray:
     """(rows, columns): how often each of the corners (rows, columns, 2) px disagrees with its
-    neighbours. As a smooth lens shows a board, no square is crossed or mirrored, and steps along
-    rows and columns change little from one to the next."""
-    odd = np.zeros(grid.shape[:2], int)
-
-    def mark(bad: np.ndarray, *places: tuple[int, int]) -> None:
-        for row, column in places:
-            odd[row : row + bad.shape[0], column : column + bad.shape[1]] += bad
-
-    across, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
-    for i, a in enumerate((across[:-1], across[1:])):
-        for j, d in enumerate((down[:, :-1], down[:, 1:])):
-            mark(_cross(a, d) <= 0, (i, 0), (i, 1), (1 - i, j))
-    for axis in (0, 1):
-        units = np.linalg.norm(np.diff(_shaped(board.points, board), axis=axis), axis=-1)
-        steps = np.diff(grid, axis=axis) / units[..., None]
-        ahead, behind = ((slice(k, k - 1 or None),) for k in (0, 1))
-        px, where = np.linalg.norm(steps, axis=-1), (slice(None),) * axis
-        least = np.minimum(px[where + ahead], px[where + behind])
-        change = np.linalg.norm(np.diff(steps, axis=axis), axis=-1)
-        mark(change > MOST_CHANGE * least, *((k * (1 - axis), k * axis) for k in range(3)))
+    neighbours. As a smooth lens shows a board, it is not mirrored, and steps along rows and columns
+    change little from one to the next."""
+    odd = np.full(grid.shape[:2], int(_turn(grid) < 0))
+    for steps, marks in _steps(grid, board, odd):
+        px, change = (np.linalg.norm(s, axis=-1) for s in (steps, np.diff(steps, axis=0)))
+        bad = change > MOST_CHANGE * np.minimum(px[1:], px[:-1])
+        for k in range(3):
+            marks[k : k + len(bad)] += bad
     return odd
 
 
 def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
     """(rows, columns): the smallest length, px, of the board's unit of length from each corner to
     its neighbours; NaN without neighbours."""
-    sides = (slice(0, -2), slice(1, -1)), (slice(2, None), slice(1, -1))
-    px, units = (
-        [
-            np.linalg.norm(
-                np.pad(a, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)[s] - a, axis=-1
-            )
-            for s in (*sides, *(side[::-1] for side in sides))
-        ]
-        for a in (grid, _shaped(board.points, board))
-    )
-    return np.fmin.reduce([p / u for p, u in zip(px, units, strict=True)])
+    least = np.full(grid.shape[:2], np.nan)
+    for steps, part in _steps(grid, board, least):
+        px = np.linalg.norm(steps, axis=-1)
+        part[1:], part[:-1] = np.fmin(part[1:], px), np.fmin(part[:-1], px)
+    return least
 
 
 def edge_width(picture: np.ndarray, corners: np.ndarray, board: Board) -> float:
     """px, of the edges at the corners of a board: 2 where they are sharp, and 2.5 σ where they are
     blurred by a Gaussian."""
-    grey = with_channels(np.atleast_3d(picture), 1)[..., 0].astype(np.float64)
+    grey = _grey(picture).astype(np.float64)
     reach = pixels_per_unit(_shaped(corners, board), board).ravel() * board.reach
     widths = []
     for (x, y), half in zip(corners, np.clip(reach, 2, 15), strict=True):
@@ -169,35 +169,26 @@ def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] |
 
     None if there is none: the pictures have bright corners, or their bright part is not round.
     """
-    brightest = np.maximum.reduce([with_channels(np.atleast_3d(p), 1)[..., 0] for p in pictures])
-    light = cv2.GaussianBlur(brightest, (0, 0), 1.0).astype(np.float64)
+    light = cv2.GaussianBlur(np.maximum.reduce([_grey(p) for p in pictures]), (0, 0), 1.0)
     height, width = light.shape
     part = max(2, min(height, width) // 40)
-    ends = [light[:part], light[-part:]]
-    dark = max(
-        np.median(end[:, side]) for end in ends for side in (slice(part), slice(-part, None))
-    )
+    ends = slice(part), slice(-part, None)
+    dark = max(np.median(light[rows, columns]) for rows in ends for columns in ends)
     middle = np.median(light[height // 4 : -height // 4, width // 4 : -width // 4])
-    if dark > 0.25 * middle:
+    there = (light > dark + max(4.0, 0.15 * (middle - dark))).astype(np.uint8)
+    outlines, _ = cv2.findContours(there, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if dark > 0.25 * middle or not outlines:
         return None
-    there = light > dark + max(4.0, 0.15 * (middle - dark))
-    rows, columns = np.flatnonzero(there.any(1)), np.flatnonzero(there.any(0))
-    x = [there.argmax(1)[rows], width - 1 - there[:, ::-1].argmax(1)[rows], columns, columns]
-    y = [rows, rows, there.argmax(0)[columns], height - 1 - there[::-1].argmax(0)[columns]]
-    rim = np.stack((np.concatenate(x), np.concatenate(y)), 1).astype(np.float64)
+    rim = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64)
     rim = rim[((rim > 1) & (rim < (width - 2, height - 2))).all(1)]
-    kept, near = rim, 0.0
-    for _ in range(20):
-        if len(kept) < 16:
-            return None
-        terms = np.column_stack((2 * kept, np.ones(len(kept))))
-        a, b, c = np.linalg.lstsq(terms, (kept**2).sum(1), rcond=None)[0]
-        radius = math.sqrt(max(c + a * a + b * b, 0.0))
-        off = np.abs(np.hypot(*(rim - (a, b)).T) - radius)
-        near = max(1.5, 0.01 * radius, float(np.median(off)))
-        kept = rim[off < near]
-    round_ = near <= max(1.5, 0.01 * radius) and len(kept) > 0.6 * len(rim)
-    return (float(a), float(b), radius) if round_ else None
+    # Dents, such as a dark board makes, are inside of the smallest circle.
+    (x, y), radius = cv2.minEnclosingCircle(rim.astype(np.float32))
+    near = np.abs(np.hypot(*(rim - (x, y)).T) - radius) < max(2.0, 0.015 * radius)
+    if near.sum() < max(16, 0.6 * len(rim)):
+        return None
+    terms = np.column_stack((2 * rim, np.ones(len(rim))))[near]
+    a, b, c = np.linalg.lstsq(terms, (rim**2).sum(1)[near], rcond=None)[0].tolist()
+    return a, b, math.sqrt(c + a * a + b * b)
 
 
 def _scales(grey: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
@@ -223,53 +214,43 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
             grid = _shaped(corners.astype(np.float64), board)
             # The outer ends of a smaller board's squares are no corners, a whole line of them.
             if (~_are_saddles(tried, grid)).sum() < min(board.rows, board.columns) / 2:
-                turn = _cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
                 # A chessboard looks the same from its other end, but is never mirrored.
-                yield ((grid if turn.mean() > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
+                yield ((grid if _turn(grid) > 0 else grid[:, ::-1]) + 0.5) / scale - 0.5
 
 
 def _are_saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """(rows, columns): True if two opposite squares at a corner are darker than the others."""
     across, down = (0.35 * np.gradient(grid, axis=axis) for axis in (1, 0))
-
-    def light(aside: np.ndarray) -> np.ndarray:
-        x, y = np.moveaxis((grid + aside).astype(np.float32), 2, 0)
-        return cv2.remap(grey, x, y, cv2.INTER_LINEAR)
-
     both, other = across + down, across - down
-    a, b, c, d = light(both), light(-both), light(other), light(-other)
+    places = np.array([grid + aside for aside in (both, -both, other, -other)], np.float32)
+    x, y = places.reshape(4, -1, 2).transpose(2, 0, 1)
+    a, b, c, d = cv2.remap(grey, x, y, cv2.INTER_LINEAR).reshape(4, *grid.shape[:2])
     return (np.maximum(a, b) < np.minimum(c, d)) | (np.minimum(a, b) > np.maximum(c, d))
 
 
 def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     size = board.columns + 1, board.rows + 1
     drawn = cv2.aruco.CharucoBoard(size, board.square, board.other, _dictionary(board.dictionary))
-    detector = cv2.aruco.CharucoDetector(drawn, detectorParams=_parameters())
-    yield _shaped(_collected(grey, detector.detectBoard, len(board.points), 1), board)
+    for white_first in (False, True):
+        drawn.setLegacyPattern(white_first)
+        detect = cv2.aruco.CharucoDetector(drawn).detectBoard
+        yield _shaped(_collected(grey, detect, len(board.points), 1), board)
 
 
 def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     """The grids for tags with a border of one bit, or two as Kalibr's, which count from the upper
     or the lower left, and whose first corner is any of the four."""
     rows, columns = board.rows // 2, board.columns // 2
-    markers, found = _dictionary(board.dictionary), []
-    for border in (1, 2):
-        detector = cv2.aruco.ArucoDetector(markers, _parameters(border))
+    parameters, found = cv2.aruco.DetectorParameters(), []
+    for parameters.markerBorderBits in (1, 2):
+        detector = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), parameters)
         found.append(_collected(grey, detector.detectMarkers, rows * columns, 4))
-        if np.isfinite(found[0]).mean() > 0.2:
-            break
     tags = max(found, key=lambda corners: np.isfinite(corners).sum())
     for turn in range(4):
         # A tag's corners run clockwise: upper left, upper right, lower right, lower left.
         cells = np.roll(tags, turn, 1)[:, [0, 1, 3, 2]].reshape(rows, columns, 2, 2, 2)
         for way in (cells, cells[::-1]):
             yield _shaped(way.swapaxes(1, 2), board)
-
-
-def _parameters(border: int = 1) -> cv2.aruco.DetectorParameters:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.minMarkerPerimeterRate, parameters.markerBorderBits = 0.01, border
-    return parameters
 
 
 def _collected(grey: np.ndarray, detect: Callable[..., tuple], count: int, each: int) -> np.ndarray:
@@ -290,32 +271,53 @@ def _refined(grey: np.ndarray, grid: np.ndarray, board: Board) -> np.ndarray:
     """The grid with each corner where the gradients around it meet, in a window without edges of
     other corners."""
     px = pixels_per_unit(grid, board)
-    scale = 2 if np.nanmin(px) * board.reach < 6 else 1
+    scale = 2 if np.fmin.reduce(px, axis=None) * board.reach < 6 else 1
     large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    windows = np.nan_to_num(np.clip(px * board.reach * scale, 2, 12)).astype(int)
     best, end = grid.copy(), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
-    for window in np.unique(windows[windows > 0]).tolist():
-        chosen = windows == window
-        places = ((grid[chosen] + 0.5) * scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
-        cv2.cornerSubPix(large, places, (window, window), (-1, -1), end)
-        best[chosen] = (places[:, 0] + 0.5) / scale - 0.5
-    far = np.linalg.norm(best - grid, axis=-1) > 0.3 * px * board.square
-    return np.where(far[..., None], grid, best)
+    for at in zip(*np.nonzero(np.isfinite(px)), strict=True):
+        window = int(np.clip(px[at] * board.reach * scale, 2, 12))
+        place = ((grid[at] + 0.5) * scale - 0.5).astype(np.float32)[None]
+        moved = cv2.cornerSubPix(large, place, (window, window), (-1, -1), end)[0]
+        moved = (moved + 0.5) / scale - 0.5
+        if np.linalg.norm(moved - grid[at]) < 0.3 * px[at] * board.square:
+            best[at] = moved
+    return best
+
+
+def _steps(
+    grid: np.ndarray, board: Board, out: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For columns and for rows: the steps between corners, px per unit of length, along axis 0; and
+    a view of `out`, (rows, columns), that fits them."""
+    points = _shaped(board.points, board)
+    yield np.diff(grid, axis=0) / np.diff(points[..., 1:], axis=0), out
+    across = np.diff(grid, axis=1) / np.diff(points[..., :1], axis=1)
+    yield across.swapaxes(0, 1), out.T
+
+
+def _turn(grid: np.ndarray) -> float:
+    """Above 0 if a grid's rows and columns run as on the board, and below 0 if it is mirrored."""
+    (ax, ay), (bx, by) = np.diff(grid, axis=1)[:-1].T, np.diff(grid, axis=0)[:, :-1].T
+    return float(np.nansum(ax * by - ay * bx))
+
+
+def _grey(picture: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(with_channels(np.atleast_3d(picture), 1)[..., 0])
 
 
 def _shaped(corners: np.ndarray, board: Board) -> np.ndarray:
     return corners.reshape(board.rows, board.columns, 2)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _names() -> list[str]:
+    """OpenCV's sets of markers."""
+    return [known.removeprefix("DICT_") for known in dir(cv2.aruco) if known.startswith("DICT_")]
 
 
 def _dictionary(name: str, least: int = 0) -> cv2.aruco.Dictionary:
     """OpenCV's set of markers; ValueError for an unknown one, or fewer than `least` markers."""
-    names = [known.removeprefix("DICT_") for known in dir(cv2.aruco) if known.startswith("DICT_")]
-    if name not in names:
-        raise ValueError(f"there is no dictionary {name!r}{did_you_mean(name, names)}")
+    if name not in _names():
+        raise ValueError(f"there is no dictionary {name!r}{did_you_mean(name, _names())}")
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
     many = len(markers.bytesList)
     check("dictionary", name, many >= least, f"one of {least} markers or more, not of {many}")

@@ -8,6 +8,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 import yaml
@@ -15,7 +16,7 @@ import yaml
 from darswin.utils.nearest import nearest
 
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
-_WORDS = {int: "a whole number", float: "a number"}
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
 class Parser(argparse.ArgumentParser):
@@ -85,17 +86,20 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
         elif isinstance(text, str):
             try:
                 given[name] = _value(text, kinds[name])
-            except (ValueError, yaml.YAMLError):
+            except (ValueError, KeyError, yaml.YAMLError):
                 parser.error(f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}")
     commands(**given)
 
 
 def check_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
-    """Raises ValueError if writing `out` would replace one of the files that a command reads."""
-    if out is None or not os.path.exists(out):
+    """Raises ValueError if `out` cannot be written, or would replace a file that is read."""
+    if out is None:
         return
+    folder = next(parent for parent in Path(out).absolute().parents if parent.exists())
+    if os.path.isdir(out) or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise ValueError(f"--{option} must be a file in a folder that can be written, got {out}")
     for name in inputs:
-        if os.path.exists(name) and os.path.samefile(name, out) and os.path.isfile(out):
+        if all(map(os.path.isfile, (name, out))) and os.path.samefile(name, out):
             raise ValueError(f"--{option} {out} would replace {name}, which this command reads")
 
 
@@ -116,8 +120,10 @@ def _is_list(kind: Any) -> bool:
 
 
 def _value(text: str, kind: Any) -> Any:
-    """Converts a text to a type; ValueError or YAMLError if that is impossible."""
+    """Converts a text to a type; ValueError, KeyError or YAMLError if that is impossible."""
     choices = typing.get_args(kind)
+    if kind is bool:
+        return {"true": True, "false": False}[text.lower()]
     if not _is_list(kind):
         if choices and text not in choices:
             raise ValueError
@@ -155,7 +161,7 @@ def _typed(default: Any) -> str:
         return ",".join(map(str, default))
     if isinstance(default, float):
         return f"{default:g}"
-    return str(default)
+    return str(default).lower() if isinstance(default, bool) else str(default)
 
 
 def with_lists(

@@ -2,10 +2,11 @@
 
 import json
 import math
+import os
 import re
 from collections import Counter
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 
@@ -13,10 +14,13 @@ import darswin.lens
 from darswin.cli.arguments import check_out
 from darswin.lens.base import Lens
 from darswin.lens.files.load import reach
+from darswin.utils.exif import TURNS
 from darswin.utils.files import replace_file
-from darswin.utils.parameters import check
+from darswin.utils.parameters import check, with_flags
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from darswin.calibrate import Board, Calibration
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
@@ -24,22 +28,23 @@ Kind = Literal["chessboard", "charuco", "april"]
 LEAST = 3  # pictures
 BLURRED = 4.0, 1.6  # px, and by the median of all boards: the width of edges
 TRIED = 5  # pictures that are looked at again to say what is wrong
-DICTIONARIES = {"charuco": "4X4_250", "april": "APRILTAG_36h11"}
+LISTED = 10  # pictures that are named
 
 
 def calibrate(
     pictures: Sequence[str] = (), *, board: str, square: float, kind: Kind = "chessboard",
     marker: float | None = None, gap: float | None = None, dictionary: str | None = None,
     model: str = "auto", out: str = "camera.json", picture: str | None = None,
-    report: str | None = None, format: Format | None = None,
+    report: str | None = None, format: Format | None = None, square_pixels: bool = True,
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
     It takes 10 to 20 pictures in which the board is tilted, at several distances, and everywhere in
     the picture, also at its rim. Pixels are those that the camera stores, as in all calibrations.
+    Pictures that cannot be read are named at the end; the calibration is made from all others.
 
     Args:
-        pictures: pictures, and folders of them.
+        pictures: pictures, and folders of them. Videos are not read.
         board: columns and rows, e.g. 9x6: a chessboard's inner corners, a ChArUco board's squares,
             or the tags of a grid.
         square: the side of a square, or of a tag, in metres or any other unit of length.
@@ -54,13 +59,16 @@ def calibrate(
         picture: a figure to write: the corners, what they miss, how sure the lens is.
         report: a JSON file to write with all that was found.
         format: the format of the calibration, as for `darswin lens convert`.
+        square_pixels: whether the camera's pixels are square. With false, the ratio of their sides
+            is found too, which needs more pictures.
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
     from darswin.cli.predict import check_paths, pictures_and_videos
+    from darswin.utils.image import BrokenImageError
     from darswin.utils.progress import Progress
 
-    made = _board(kind, board, square, marker, gap, dictionary)
+    made = _board(kind, board, square, marker=marker, gap=gap, dictionary=dictionary)
     if model != "auto" and model not in darswin.lens.MODELS:
         raise ValueError(f"--model: {darswin.lens.base.unknown_model(model)}")
     if picture is not None:
@@ -69,22 +77,34 @@ def calibrate(
         figure_format(picture)
     check_paths(pictures)
     names = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
-    for option, file in (("out", out), ("picture", picture), ("report", report)):
+    outs = {"out": out, "picture": picture, "report": report}
+    for option, file in outs.items():
         check_out(file, names, option)
+    written = [os.path.realpath(file) for file in outs.values() if file is not None]
+    if len({*written}) < len(written):
+        raise ValueError("--out, --picture and --report must be different files")
     if not names:
-        raise ValueError("missing pictures: give pictures of a board, or folders of them")
+        raise ValueError(
+            "missing pictures: give pictures of a board, or folders of them; videos are not read"
+        )
     with Progress("corners", len(names)) as progress:
-        seen = _Seen(names, made, progress)
+        seen = _look(names, made, progress)
     if len(seen.names) < LEAST:
-        raise ValueError(_why(seen, made, board))
+        few = f"{len(seen.names)} of {seen.total} pictures show the board of --board {board}"
+        why = "; ".join([f"{few}: {LEAST} are needed, and 10 to 20 are better", *seen.doubts])
+        raise ValueError("\n".join([why, *seen.bad]))
     with Progress("calibrate") as progress:
         found = found_by(
-            seen.corners, made, seen.size, model, names=seen.names,
-            progress=lambda step: setattr(progress, "step", step),
+            seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
+            square_pixels=square_pixels, progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
-    lens = _within(seen.circle(), found.lens)
+    lens = _within(seen.brightest, found.lens)
     print(_summary(found, seen, lens))
-    write_lens(lens, out, format)
+    try:
+        write_lens(lens, out, format)
+    except ValueError as error:  # the format cannot hold the lens
+        write_lens(lens, f"{out}.json", "darswin")
+        raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
@@ -93,8 +113,11 @@ def calibrate(
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
-        replace_file(report, json.dumps(entries, indent=1, ensure_ascii=False))
+        entries["doubts"] = seen.doubts + found.doubts
+        replace_file(report, json.dumps(entries, indent=1))
         print(report)
+    if seen.bad:
+        raise BrokenImageError("\n".join(seen.bad))
 
 
 def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
@@ -108,90 +131,106 @@ def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> N
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
-def _board(
-    kind: Kind, board: str, square: float, marker: float | None, gap: float | None,
-    dictionary: str | None,
-) -> "Board":  # fmt: skip
+def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":
     from darswin.calibrate import Board
 
-    sides = re.fullmatch(r"\s*(\d{1,3})\s*[x×X*,]\s*(\d{1,3})\s*", board)
-    least = {"chessboard": 2, "charuco": 3, "april": 1}[kind]
-    in_range = sides is not None and all(least <= int(n) <= 100 for n in sides.groups())
+    least = 1 if kind == "april" else 3
+    found = re.fullmatch(r"\s*(\d{1,3})\s*[x×X*,]\s*(\d{1,3})\s*", board)
+    sides = [int(side) for side in found.groups()] if found else [0]
+    in_range = all(least <= side <= 100 for side in sides)
     check("board", board, in_range, f"columns and rows from {least} to 100, such as 9x6")
-    columns, rows = (int(n) for n in sides.groups()) if sides else (0, 0)
-    needed = {"charuco": ("marker", marker), "april": ("gap", gap)}
-    for of, (name, value) in needed.items():
-        if (value is None) == (kind == of):
-            are = "the side of the markers" if of == "charuco" else "the gap between tags"
-            raise ValueError(f"--kind {of}, and no other, needs --{name}: {are}")
     check("square", square, 0 < square < math.inf, "positive")
-    if kind == "chessboard":
-        if dictionary is not None:
-            raise ValueError("a chessboard has no --dictionary")
-        return Board.chessboard(columns, rows, square)
-    make = Board.charuco if kind == "charuco" else Board.april_grid
-    return make(columns, rows, square, needed[kind][1] or 0.0, dictionary or DICTIONARIES[kind])
+    needed = {"chessboard": "", "charuco": "marker", "april": "gap"}[kind]
+    if needed and given[needed] is None:
+        raise ValueError(f"--kind {kind} needs --{needed}")
+    given = {name: value for name, value in given.items() if value is not None}
+    if needless := given.keys() - ({needed, "dictionary"} if needed else {}):
+        raise ValueError(f"--kind {kind} has no --{min(needless)}")
+    make: Any = Board.april_grid if kind == "april" else getattr(Board, kind)
+    return make(*sides, square, **given)
 
 
-class _Seen:
-    """What the pictures show.
+class _Seen(NamedTuple):
+    """What pictures show: the names and corners of those with the board; the names of those
+    without; the brightest levels, (H, W, 1); doubts; errors of pictures that cannot be read."""
 
-    Attributes: names, corners, widths: of the pictures with the board, and of its edges (px);
-    without: the other pictures; size: (H, W) of all; brightest: the maximum of those with it.
-    """
+    names: list[str]
+    corners: "np.ndarray"
+    without: list[str]
+    brightest: "np.ndarray"
+    doubts: list[str]
+    bad: list[str]
 
-    def __init__(self, files: Sequence[str], board: "Board", progress: Any):
-        import numpy as np
-
-        from darswin.calibrate import find_corners
-        from darswin.calibrate.boards import edge_width
-        from darswin.utils.image import read_stored
-
-        self.names: list[str] = []
-        self.without: list[str] = []
-        self.corners: Any = []
-        self.widths: list[float] = []
-        brightest = read_stored(files[0], 1)
-        for name in files:
-            image = read_stored(name, 1)
-            if brightest.shape != image.shape:
-                (one, other) = (f"{a.shape[1]}×{a.shape[0]}" for a in (brightest, image))
-                raise ValueError(
-                    f"all pictures must have one size: {files[0]} has {one} (W×H) px, {name} has "
-                    f"{other}"
-                )
-            corners = find_corners(image, board)
-            if np.isfinite(corners).any():
-                brightest = np.maximum(brightest, image) if self.names else image
-                self.names.append(name)
-                self.corners.append(corners)
-                self.widths.append(edge_width(image, corners, board))
-            else:
-                self.without.append(name)
-            progress.done += 1
-        self.brightest, self.size = brightest, (brightest.shape[0], brightest.shape[1])
-        self.corners = np.array(self.corners)
-
-    def circle(self) -> tuple[float, float, float] | None:
-        from darswin.calibrate.boards import image_circle
-
-        return image_circle([self.brightest])
-
-    def doubts(self) -> list[str]:
-        least, times = BLURRED
-        usual = sorted(self.widths)[len(self.widths) // 2]
-        blurred = [
-            f"{name} ({width:.1f} px)"
-            for name, width in zip(self.names, self.widths, strict=True)
-            if width > max(least, times * usual)
-        ]
-        said = [f"blurred, by the width of edges: {', '.join(blurred)}"] if blurred else []
-        return said + ([f"no board found in {', '.join(self.without)}"] if self.without else [])
+    @property
+    def total(self) -> int:
+        return len(self.names) + len(self.without)
 
 
-def _within(circle: tuple[float, float, float] | None, lens: Lens) -> Lens:
+def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
+    import numpy as np
+
+    from darswin.calibrate import find_corners
+    from darswin.calibrate.boards import edge_width, shown_instead
+    from darswin.utils.image import BrokenImageError, as_stored, read_oriented
+
+    corners: dict[str, np.ndarray] = {}
+    widths: dict[str, float] = {}
+    without: dict[str, str] = {}  # the board, and what they show instead
+    known: dict[int, str] = {}
+    first, brightest, doubts, bad = "", np.zeros((1, 1, 1), np.uint8), [], []
+    for progress.done, name in enumerate(files):
+        try:
+            image = as_stored(*(read := read_oriented(name, 1)))
+        except BrokenImageError as error:
+            bad.append(with_flags(error))
+            continue
+        if not known:
+            first, brightest = name, np.zeros_like(image)
+        if brightest.shape != image.shape:
+            one, other = (f"{a.shape[1]}×{a.shape[0]}" for a in (brightest, image))
+            raise ValueError(
+                f"all pictures must have one size: {first} has {one} (W×H) px, {name} has {other}"
+            )
+        if (same := known.setdefault(hash(image.tobytes()), name)) is not name:
+            doubts.append(f"{name} shows the same as {same}, and is left out")
+            continue
+        # Mirrored by the camera, whose pictures the others turn back.
+        way = slice(None, None, -1 if sum(TURNS[read[1]]) % 2 else 1)
+        places = find_corners(image[:, way], board)
+        if np.isnan(places).all():
+            without[name] = shown_instead(image[:, way], board) if len(without) < TRIED else ""
+            continue
+        widths[name] = edge_width(image[:, way], places, board)
+        brightest = np.maximum(brightest, image)
+        if way.step < 0:  # a board is symmetric
+            places = places.reshape(board.rows, -1, 2)[:, ::-1].reshape(-1, 2)
+            places = (image.shape[1] - 1, 0) + places * (-1, 1)
+        corners[name] = places
+    if without:
+        doubts.append(f"no board found in {_listed(without)}")
+        tried = [*without.values()][:TRIED]
+        counts = Counter(filter(None, tried)).items()
+        instead, count = max(counts, key=lambda item: item[::-1], default=("", 0))
+        # Beside pictures with the board, others may show a part of it.
+        if instead and (len(corners) < LEAST or 2 * count > len(tried)):
+            doubts[-1] += f": they show {instead}"
+    least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values()] or [0])))
+    if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
+        doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
+    found = np.array([*corners.values()])
+    return _Seen([*corners], found, [*without], brightest, doubts, bad)
+
+
+def _listed(names: Collection[str]) -> str:
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join([*names][:LISTED]) + more
+
+
+def _within(brightest: "np.ndarray", lens: Lens) -> Lens:
     """The lens with the θ_max of the image circle, if the pictures have one."""
-    if circle is None:
+    from darswin.calibrate.boards import image_circle
+
+    if (circle := image_circle([brightest])) is None:
         return lens
     x, y, radius = circle
     around = torch.linspace(0, 2 * math.pi, 64, dtype=torch.float64)
@@ -201,15 +240,14 @@ def _within(circle: tuple[float, float, float] | None, lens: Lens) -> Lens:
 
 
 def _summary(found: "Calibration", seen: _Seen, lens: Lens) -> str:
-    used, total = int(found.used.sum()), len(seen.names) + len(seen.without)
     corners = int((found.weights > 0.1).sum())
     rows = [
-        ("pictures", f"{used} of {total}"),
+        ("pictures", f"{int(found.used.sum())} of {seen.total}"),
         ("corners", f"{corners} of {found.weights.numel()}"),
         ("noise", f"{found.sigma:.3f} px along x and y"),
         ("left out", f"{found.left_out:.3f} px in pictures that were left out"),
         ("supported", f"up to {math.degrees(found.supported):.1f}° from the axis"),
-        *(("looks wrong", doubt) for doubt in [*seen.doubts(), *found.doubts]),
+        *(("looks wrong", doubt) for doubt in [*seen.doubts, *found.doubts]),
     ]
     lines = [f"{name:<16}{text}" for name, text in rows]
     if found.models:
@@ -217,28 +255,3 @@ def _summary(found: "Calibration", seen: _Seen, lens: Lens) -> str:
     for name, left_out, error, reason in found.models:
         lines.append(f"{name:<16}" + (reason or f"{left_out:>12.3f}{error:>12.3f}"))
     return "\n".join(lines)
-
-
-def _why(seen: _Seen, board: "Board", given: str) -> str:
-    """Why too few pictures show the board."""
-    import cv2
-    import numpy as np
-
-    from darswin.calibrate import find_corners
-    from darswin.utils.image import read_stored
-
-    said = f"{len(seen.names)} of {len(seen.names) + len(seen.without)} pictures show the board"
-    again = [read_stored(name, 1) for name in seen.without[:TRIED]]
-    if board.kind != "chessboard":
-        if any(np.isfinite(find_corners(image[:, ::-1], board)).any() for image in again):
-            return f"{said}: the pictures are mirrored, flip them first"
-    else:
-        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-        sizes: Counter = Counter()
-        for image in again:
-            there, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
-            sizes.update([tuple(sorted(meta.shape, reverse=True))] if there else [])
-        if sizes and (size := max(sizes, key=lambda size: (sizes[size], size))) > (3, 3):
-            return f"{said} of --board {given}: they show {size[0]}x{size[1]} inner corners"
-    none = f", not {', '.join(seen.without)}" if seen.names and seen.without else ""
-    return f"{said}{none}: {LEAST} are needed, and 10 to 20 are better"

@@ -62,7 +62,11 @@ def read_stored(path: str | Path, channels: int = 3) -> np.ndarray:
     Raises:
         BrokenImageError: see `read_oriented`.
     """
-    image, orientation = read_oriented(path, channels)
+    return as_stored(*read_oriented(path, channels))
+
+
+def as_stored(image: np.ndarray, orientation: int) -> np.ndarray:
+    """An upright picture with its pixels as the camera stores them."""
     swapped, *reversed_ = TURNS[orientation]
     across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
     image = image[down, across]

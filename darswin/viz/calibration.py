@@ -60,16 +60,14 @@ def _draw_residuals(
     length = np.linalg.norm(misses, axis=1)
     usual = max(float(np.quantile(length, 0.95)), 1e-9)
     width = lens.image_size[0, 1].item()
-    for chosen, colour in ((counts, "C0"), (~counts, "red")):
-        # Wrong corners would have arrows across the whole picture.
-        shown = misses[chosen] * np.minimum(1, 2 * usual / length[chosen].clip(1e-9))[:, None]
-        arrows = axes.quiver(
-            *places[chosen].T, *shown.T, color=colour, angles="xy", scale_units="xy",
-            scale=usual / (LONGEST * width), width=0.004,
-        )  # fmt: skip
-        if colour == "C0":
-            round_ = float(f"{usual:.1g}")
-            axes.quiverkey(arrows, 0.5, -0.1, round_, f"{round_:g} px", labelpos="E")
+    # Wrong corners would have arrows across the whole picture.
+    shown = misses * np.minimum(1, 2 * usual / length.clip(1e-9))[:, None]
+    arrows = axes.quiver(
+        *places.T, *shown.T, color=np.where(counts, "C0", "red"), angles="xy", scale_units="xy",
+        scale=usual / (LONGEST * width), width=0.004,
+    )  # fmt: skip
+    round_ = float(f"{usual:.1g}")
+    axes.quiverkey(arrows, 0.5, -0.1, round_, f"{round_:g} px", labelpos="E", color="C0")
 
 
 def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:

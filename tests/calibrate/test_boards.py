@@ -107,6 +107,17 @@ def test_grids_of_kalibr_are_read(upside_down):
     np.testing.assert_allclose(find_corners(picture, board), true, atol=0.5)
 
 
+@pytest.mark.parametrize("rows", [5, 6])
+@pytest.mark.parametrize("white_first", [False, True])
+def test_charuco_boards_may_begin_with_a_white_square(rows, white_first):
+    drawn = cv2.aruco.CharucoBoard((7, rows), 1.0, 0.7, cv2.aruco.getPredefinedDictionary(2))
+    drawn.setLegacyPattern(white_first)
+    picture = cv2.GaussianBlur(drawn.generateImage((420, 60 * rows)), (0, 0), 0.7)
+    picture = cv2.copyMakeBorder(picture, 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    board = Board.charuco(7, rows, 60.0, 42.0)
+    np.testing.assert_allclose(find_corners(picture, board), board.points + 89.5, atol=0.5)
+
+
 @pytest.fixture(scope="module")
 def one() -> tuple[Renderer, Pose, np.ndarray]:
     view, rng = camera(150, (360, 360)), np.random.default_rng(1)
@@ -204,7 +215,7 @@ def test_true_corners_are_never_wrong(fov):
 
 def test_points_are_in_the_unit_of_the_square():
     expected = [[0, 0], [2, 0], [4, 0], [0, 2], [2, 2], [4, 2]]
-    np.testing.assert_array_equal(Board.chessboard(3, 2, 2.0).points, expected)
+    np.testing.assert_array_equal(Board.chessboard(3, 3, 2.0).points[:6], expected)
     np.testing.assert_array_equal(Board.charuco(4, 3, 2.0, 1.0).points, expected)
     grid = Board.april_grid(2, 1, 2.0, 0.5).points
     x = [0, 2, 2.5, 4.5]
@@ -214,7 +225,7 @@ def test_points_are_in_the_unit_of_the_square():
 @pytest.mark.parametrize(
     ("make", "error", "said"),
     [
-        (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 2 to 100, got 1"),
+        (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 3 to 100, got 1"),
         (lambda: Board.chessboard(9, 6.0, 0.1), TypeError, "`rows` must be a whole number"),
         (lambda: Board.chessboard(9, 6, 0.0), ValueError, "`square` must be positive, got 0"),
         (lambda: Board.chessboard(9, 6, math.nan), ValueError, "`square` must be positive"),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import shutil
 
@@ -20,8 +21,9 @@ TRUE = lens.KannalaBrandt(
     torch.tensor(100.0, dtype=torch.float64), (0.02, -0.004), math.radians(95),
     center=(181.0, 158.0), image_size=(320, 360),
 )  # fmt: skip
-BOARD = ("--board", "6x5", "--square", "0.03")
-CHARUCO = ("--board", "6x5", "--square", "0.03", "--kind", "charuco", "--marker", "0.022")
+# A comparison of all models takes too long for tests of the command.
+BOARD = ("--board", "6x5", "--square", "0.03", "--model", "KannalaBrandt")
+CHARUCO = (*BOARD, "--kind", "charuco", "--marker", "0.022")
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def rendered(tmp_path_factory):
     view, rng = Renderer(TRUE, samples=2), np.random.default_rng(0)
     for name, board, count in (
         ("boards", Board.chessboard(6, 5, 0.03), 9),
-        ("markers", Board.charuco(6, 5, 0.03, 0.022), 1),
+        ("markers", Board.charuco(6, 5, 0.03, 0.022), 4),
     ):
         (folder / name).mkdir()
         for k, pose in enumerate(view.poses(board, count, rng)):
@@ -86,9 +88,8 @@ def test_pictures_become_a_lens_a_figure_and_a_report(folder, capsys):
 
 
 def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypatch):
-    # All models take too long for a test of the command.
     monkeypatch.setattr(
-        "darswin.calibrate.calibration.CANDIDATES", ("Perspective", "Equidistant", "KannalaBrandt")
+        "darswin.calibrate.search.CANDIDATES", ("Perspective", "Equidistant", "KannalaBrandt")
     )
     calibrate("boards", *BOARD, "--model=auto", "--out=made.yaml")
     printed = capsys.readouterr().out
@@ -98,7 +99,7 @@ def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypat
     assert_is_true(lens.load("made.yaml", dtype=torch.float64))
 
 
-@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("orientation", [2, 3, 5, 6, 8])
 def test_pixels_are_those_that_the_camera_stores(folder, capsys, orientation):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
@@ -107,6 +108,78 @@ def test_pixels_are_those_that_the_camera_stores(folder, capsys, orientation):
     calibrate("boards", *BOARD)
     assert "pictures        9 of 9" in capsys.readouterr().out
     assert_is_true(lens.load("camera.json", dtype=torch.float64))
+
+
+def test_markers_are_found_in_pictures_that_the_camera_mirrors(folder, capsys):
+    calibrate("markers", *CHARUCO, "--out=plain.json")
+    exif = Image.Exif()
+    for orientation, file in zip((2, 4, 5, 7), (folder / "markers").iterdir(), strict=True):
+        exif[ExifTags.Base.Orientation] = orientation
+        Image.open(file).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(file, exif=exif)
+    calibrate("markers", *CHARUCO)
+    printed = capsys.readouterr().out
+    assert printed.count("pictures        4 of 4") == 2 and "mirrored" not in printed
+    plain, found = (lens.load(f, dtype=torch.float64) for f in ("plain.json", "camera.json"))
+    theta = torch.linspace(0.01, math.radians(60), 30, dtype=torch.float64)
+    torch.testing.assert_close(found.project(theta), plain.project(theta), rtol=0, atol=0.2)
+    mirrored = torch.stack((359 - plain.center[:, 0], plain.center[:, 1]), 1)
+    torch.testing.assert_close(found.center, mirrored, rtol=0, atol=0.2)
+
+
+def test_pictures_that_cannot_be_read_are_named_at_the_end(folder, capsys):
+    for k in (0, 4):
+        (folder / f"boards/{k}.png").write_bytes(b"no picture")
+    with pytest.raises(SystemExit) as end:
+        calibrate("boards", *BOARD)
+    printed = capsys.readouterr()
+    assert end.value.code == 2 and "pictures        7 of 7" in printed.out
+    for k in (0, 4):
+        assert f"cannot read boards/{k}.png: no image that OpenCV can decode" in printed.err
+    assert_is_true(lens.load("camera.json", dtype=torch.float64))
+
+
+def test_a_picture_counts_once(folder, capsys):
+    (folder / "boards/copy.png").write_bytes((folder / "boards/2.png").read_bytes())
+    calibrate("boards", "boards/5.png", *BOARD)
+    printed = capsys.readouterr().out
+    assert "pictures        9 of 9" in printed
+    assert "boards/copy.png shows the same as boards/2.png, and is left out" in printed
+    assert "boards/5.png shows the same as boards/5.png, and is left out" in printed
+
+
+def test_names_that_are_no_text_are_reported(folder):
+    name = os.fsdecode(b"boards/\xff.png")
+    os.rename("boards/3.png", name)
+    calibrate("boards", *BOARD, "--report=report.json")
+    assert name in json.loads((folder / "report.json").read_text())["names"]
+
+
+@pytest.mark.parametrize("out", ["made.json", "made.yaml", "made.txt", "camchain.yaml"])
+def test_the_ratio_of_pixels_that_are_not_square_is_kept(folder, capsys, out):
+    for file in (folder / "boards").iterdir():
+        wide = cv2.resize(cv2.imread(str(file)), (400, 320), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(file), wide)
+    calibrate("boards", *BOARD, "--square_pixels=false", f"--out={out}")
+    (a, b), (c, d) = lens.load(out, dtype=torch.float64).affine[0].tolist()
+    assert b == c == 0 and a / d == pytest.approx(400 / 360, rel=2e-3)
+
+
+def test_a_lens_that_the_format_cannot_hold_is_written_as_json(folder, capsys):
+    with pytest.raises(SystemExit) as end:
+        calibrate("boards", *BOARD, "--model=OCam", "--out=made.yaml")
+    printed = capsys.readouterr()
+    assert end.value.code == 2 and "made.yaml.json: darswin, OCam" in printed.out
+    assert "cannot hold this OCam lens" in printed.err and "is in made.yaml.json" in printed.err
+    assert isinstance(lens.load("made.yaml.json"), lens.OCam)
+
+
+def test_another_board_is_described(folder, capsys):
+    line = refusal(capsys, "markers", *CHARUCO, "--dictionary=5X5_250")
+    assert re.search("they show markers [0-4] to 14 of 4X4_", line)
+    line = refusal(capsys, "markers", *CHARUCO, "--board=7x5")
+    assert re.search("they show markers [0-4] to 14 of 4X4_250", line)
+    calibrate(*(f"boards/{k}.png" for k in range(8)), "markers", *BOARD)
+    assert "no board found in markers/0.png" in capsys.readouterr().out
 
 
 def blur(file: str, sigma: float) -> None:
@@ -124,10 +197,13 @@ def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     some = [f"boards/{k}.png" for k in (0, 1)]
     line = refusal(capsys, *some, "--board=7x4", "--square=1")
     assert line.endswith(
-        "0 of 2 pictures show the board of --board 7x4: they show 6x5 inner corners"
+        "0 of 2 pictures show the board of --board 7x4: 3 are needed, and 10 to 20 are better; "
+        "no board found in boards/0.png, boards/1.png: they show 6x5 inner corners"
     )
     line = refusal(capsys, *some, *BOARD)
-    assert "2 of 2 pictures show the board: 3 are needed, and 10 to 20 are better" in line
+    assert line.endswith(
+        "2 of 2 pictures show the board of --board 6x5: 3 are needed, and 10 to 20 are better"
+    )
     (folder / "empty").mkdir()
     assert "no pictures or videos in empty" in refusal(capsys, "empty", *BOARD)
     assert "missing pictures" in refusal(capsys, *BOARD)
@@ -143,29 +219,31 @@ def test_mirrored_pictures_are_told(folder, capsys):
     for file in (folder / "markers").iterdir():
         cv2.imwrite(str(file), cv2.imread(str(file))[:, ::-1])
     line = refusal(capsys, "markers", *CHARUCO)
-    assert line.endswith(
-        "0 of 1 pictures show the board: the pictures are mirrored, flip them first"
-    )
+    assert line.endswith("markers/2.png, markers/3.png: they show it mirrored, flip them first")
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--board=9", "--square=1"], "--board must be columns and rows from 2 to 100, such as"),
-        (["--board=1x6", "--square=1"], "--board must be columns and rows from 2 to 100"),
+        (["--board=9", "--square=1"], "--board must be columns and rows from 3 to 100, such as"),
+        (["--board=2x6", "--square=1"], "--board must be columns and rows from 3 to 100"),
         (["--board=9x6", "--square=0"], "--square must be positive, got 0"),
         (["--board=9x6", "--square=.nan"], "--square must be"),
         (["--board=9x6"], "--square"),
         ([*BOARD, "--kind=round"], "--kind must be one of chessboard, charuco, april"),
-        ([*BOARD, "--kind=charuco"], "--kind charuco, and no other, needs --marker"),
-        ([*BOARD, "--kind=april"], "--kind april, and no other, needs --gap"),
-        ([*BOARD, "--marker=0.1"], "--kind charuco, and no other, needs --marker"),
-        ([*CHARUCO, "--gap=0.1"], "--kind april, and no other, needs --gap"),
+        ([*BOARD, "--kind=charuco"], "--kind charuco needs --marker"),
+        ([*BOARD, "--kind=april"], "--kind april needs --gap"),
+        ([*BOARD, "--marker=0.1"], "--kind chessboard has no --marker"),
+        ([*CHARUCO, "--gap=0.1"], "--kind charuco has no --gap"),
         ([*BOARD, "--kind=charuco", "--marker=0.1"], "--marker must be below the square of 0.03"),
         ([*CHARUCO, "--dictionary=4X4_5"], "did you mean 4X4_50?"),
-        ([*BOARD, "--dictionary=4X4_50"], "a chessboard has no --dictionary"),
+        ([*BOARD, "--dictionary=4X4_50"], "--kind chessboard has no --dictionary"),
         ([*BOARD, "--model=KanalaBrandt"], "--model: .*did you mean KannalaBrandt"),
         ([*BOARD, "--picture=made.gif"], "must end in one of .png"),
+        ([*BOARD, "--square_pixels=no"], "--square_pixels must be true or false, got no"),
+        ([*BOARD, "--out=boards"], "--out must be a file in a folder that can be written"),
+        ([*BOARD, "--report=boards/0.png/r.json"], "--report must be a file in a folder that can"),
+        ([*BOARD, "--out=a.json", "--report=./a.json"], "must be different files"),
         ([*BOARD, "--out=boards/0.png"], "--out boards/0.png would replace"),
         ([*BOARD, "--report=boards/0.png"], "--report boards/0.png would replace"),
     ],
