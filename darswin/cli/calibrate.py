@@ -4,8 +4,10 @@ import json
 import math
 import os
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -53,8 +55,8 @@ def calibrate(
         gap: the gap between AprilTags, in the same unit.
         dictionary: the markers, as OpenCV names them. The default is 4X4_250 for ChArUco boards and
             APRILTAG_36h11 for AprilTags.
-        model: the lens model, a name of darswin.lens.MODELS; or auto for the one of many that
-            predicts left-out pictures best.
+        model: the lens model, a name of darswin.lens.MODELS; or auto: of many that the file can
+            hold, the one that predicts left-out pictures best.
         out: the calibration to write.
         picture: a figure to write: the corners, what they miss, how sure the lens is.
         report: a JSON file to write with all that was found.
@@ -96,13 +98,14 @@ def calibrate(
     with Progress("calibrate") as progress:
         found = found_by(
             seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
-            square_pixels=square_pixels, progress=lambda step: setattr(progress, "step", step),
+            square_pixels=square_pixels, accept=lambda lens: _is_held(lens, out, format),
+            progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
     lens = _within(seen.brightest, found.lens)
     print(_summary(found, seen, lens))
     try:
         write_lens(lens, out, format)
-    except ValueError as error:  # the format cannot hold the lens
+    except ValueError as error:  # the format holds none of the lenses
         write_lens(lens, f"{out}.json", "darswin")
         raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
@@ -118,6 +121,16 @@ def calibrate(
         print(report)
     if seen.bad:
         raise BrokenImageError("\n".join(seen.bad))
+
+
+def _is_held(lens: Lens, out: str, format: Format | None) -> bool:
+    """True if the file's format can hold the lens."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            darswin.lens.save(lens, Path(folder) / Path(out).name, format)
+        except ValueError:
+            return False
+    return True
 
 
 def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
@@ -253,5 +266,5 @@ def _summary(found: "Calibration", seen: _Seen, lens: Lens) -> str:
     if found.models:
         lines.append(f"{'model':<16}{'left out, px':>12}{'fitted, px':>12}")
     for name, left_out, error, reason in found.models:
-        lines.append(f"{name:<16}" + (reason or f"{left_out:>12.3f}{error:>12.3f}"))
+        lines.append(f"{name:<16}" + (reason or f"{left_out:>12.4g}{error:>12.4g}"))
     return "\n".join(lines)

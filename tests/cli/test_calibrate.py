@@ -173,6 +173,16 @@ def test_a_lens_that_the_format_cannot_hold_is_written_as_json(folder, capsys):
     assert isinstance(lens.load("made.yaml.json"), lens.OCam)
 
 
+@pytest.mark.parametrize(("out", "model"), [("made.yaml", "Equidistant"), ("made.json", "OCam")])
+def test_models_that_the_format_cannot_hold_are_not_taken(folder, capsys, monkeypatch, out, model):
+    monkeypatch.setattr("darswin.calibrate.search.CANDIDATES", ("OCam", "Equidistant"))
+    calibrate("boards", *BOARD, "--model=auto", f"--out={out}")
+    printed = capsys.readouterr().out
+    rows = [line.split()[0] for line in printed.splitlines()]
+    assert rows[rows.index("model") :][1:3] == ["OCam", "Equidistant"]
+    assert type(lens.load(out)).__name__ == model
+
+
 def test_another_board_is_described(folder, capsys):
     line = refusal(capsys, "markers", *CHARUCO, "--dictionary=5X5_250")
     assert re.search("they show markers [0-4] to 14 of 4X4_", line)
