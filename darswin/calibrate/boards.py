@@ -146,7 +146,8 @@ def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
     least = np.full(grid.shape[:2], np.nan)
     for steps, part in _steps(grid, board, least):
         px = np.linalg.norm(steps, axis=-1)
-        part[1:], part[:-1] = np.fmin(part[1:], px), np.fmin(part[:-1], px)
+        part[1:] = np.fmin(part[1:], px)
+        part[:-1] = np.fmin(part[:-1], px)
     return least
 
 

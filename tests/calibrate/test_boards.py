@@ -9,7 +9,7 @@ import torch
 from calibrate_boards import Pose, Renderer
 
 from darswin.calibrate import Board, find_corners
-from darswin.calibrate.boards import edge_width, image_circle, wrong
+from darswin.calibrate.boards import edge_width, image_circle, pixels_per_unit, wrong
 from darswin.lens import Equidistant, Lens, Perspective
 
 CHESSBOARD = Board.chessboard(9, 6, 0.025)
@@ -298,3 +298,17 @@ def test_the_renderer_follows_rays_behind_the_camera():
     back = Pose(facing @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
     assert not np.isin(picture, [15, 230]).all()
     assert not np.isin(view.picture(CHESSBOARD, back, rng), [15, 230]).any()
+
+
+@pytest.mark.parametrize("board", [Board.chessboard(5, 4, 0.5), Board.april_grid(2, 2, 1.0, 0.3)])
+def test_pixels_per_unit_are_those_to_the_nearest_neighbour(board):
+    grid = np.random.default_rng(0).uniform(0, 100, (board.rows, board.columns, 2))
+    grid[1, 2] = np.nan
+    points = board.points.reshape(grid.shape)
+    least = np.full(grid.shape[:2], np.nan)
+    for row, column in np.ndindex(least.shape):
+        for y, x in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if 0 <= y < board.rows and 0 <= x < board.columns:
+                px, units = (math.dist(of[row, column], of[y, x]) for of in (grid, points))
+                least[row, column] = np.fmin(least[row, column], px / units)
+    np.testing.assert_allclose(pixels_per_unit(grid, board), least)
