@@ -91,12 +91,16 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
     commands(**given)
 
 
-def check_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
+def check_out(
+    out: str | None, inputs: Iterable[str], option: str = "out", may_be_folder: bool = False
+) -> None:
     """Raises ValueError if `out` cannot be written, or would replace a file that is read."""
     if out is None:
         return
-    folder = next(parent for parent in Path(out).absolute().parents if parent.exists())
-    if os.path.isdir(out) or not folder.is_dir() or not os.access(folder, os.W_OK):
+    path = Path(out).absolute()
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
+    fits = may_be_folder or not path.is_dir()
+    if not (fits and (there == path or there.is_dir()) and os.access(there, os.W_OK)):
         raise ValueError(f"--{option} must be a file in a folder that can be written, got {out}")
     for name in inputs:
         if all(map(os.path.isfile, (name, out))) and os.path.samefile(name, out):

@@ -140,7 +140,8 @@ def predict(
     prints = kind in ("classification", "numbers")
     files = pictures_and_videos(paths, leave_out=None if prints else out)
     names = [file.name for file in files]
-    check_out(out, [*names, str(weights), *([] if lens is None else [lens])])
+    read = [*names, str(weights), *([] if lens is None else [lens])]
+    check_out(out, read, may_be_folder=not prints)
     if lens is not None:
         lenses = given_lenses(lens, camera, coefficients, names)
     else:
