@@ -105,8 +105,9 @@ def calibrate(
             failed.append((kind.__name__, math.nan, math.nan, str(reason)))
     if not found:
         raise CalibrationError(failed[0][3])
-    # A corner that fits any model counts for all: no model may leave out the rim.
-    sigma = min(one.sigma for one in found)
+    # A corner that fits any model counts for all: no model may leave out the rim or pictures.
+    most = max(one.used.sum() for one in found)
+    sigma = min(one.sigma for one in found if one.used.sum() == most)
     counts = torch.stack([one.fits(sigma) for one in found]).any(0)
     for one in found:
         one.judge(views, counts)
