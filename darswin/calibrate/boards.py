@@ -14,6 +14,7 @@ from darswin.utils.parameters import check
 
 Kind = Literal["chessboard", "charuco", "april"]
 
+LEAST_SIDE = 16  # px: smaller pictures show nothing
 SIDE = 1200  # px, to which larger pictures are reduced at first
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
@@ -97,7 +98,7 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
         raise ValueError(f"a picture must be (H, W), (H, W, 1) or (H, W, 3), got {picture.shape}")
     grey = _grey(picture)
     find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
-    for grid in find(grey, board) if grey.size else ():
+    for grid in find(grey, board) if min(grey.shape) >= LEAST_SIDE else ():
         grid = _refined(grey, grid, board)
         least = max(8, 0.9 * np.isfinite(grid).sum())
         # Markers tell each corner, so single wrong ones can be left out.
@@ -170,8 +171,11 @@ def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] |
 
     None if there is none: the pictures have bright corners, or their bright part is not round.
     """
-    light = cv2.GaussianBlur(np.maximum.reduce([_grey(p) for p in pictures]), (0, 0), 1.0)
-    height, width = light.shape
+    brightest = np.maximum.reduce([_grey(picture) for picture in pictures])
+    height, width = brightest.shape
+    if min(height, width) < LEAST_SIDE:
+        return None
+    light = cv2.GaussianBlur(brightest, (0, 0), 1.0)
     part = max(2, min(height, width) // 40)
     ends = slice(part), slice(-part, None)
     dark = max(np.median(light[rows, columns]) for rows in ends for columns in ends)
@@ -209,7 +213,10 @@ def _chessboards(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
         (cv2.findChessboardCorners, older),
     ):
         for tried, scale in _scales(grey):
-            there, corners = detect(tried, (board.columns, board.rows), flags=flags)
+            try:
+                there, corners = detect(tried, (board.columns, board.rows), flags=flags)
+            except cv2.error:  # the older detector fails on some noise
+                continue
             if not there:
                 continue
             grid = _shaped(corners.astype(np.float64), board)

@@ -28,7 +28,7 @@ def curves(picture: np.ndarray) -> list[np.ndarray]:
     smooth = cv2.GaussianBlur(even, (0, 0), BLUR)
     gradient = np.stack([cv2.Scharr(smooth, cv2.CV_32F, *d) / 32 for d in ((1, 0), (0, 1))], -1)
     points, normal = _edge_points(gradient)
-    shortest = SHORTEST * np.hypot(*grey.shape)
+    shortest = max(SHORTEST * np.hypot(*grey.shape), 3)
     chains = _chains(points, normal, grey.shape)
     found = [p for c in chains if len(c) > shortest for p in _smooth(points[c], shortest)]
     return sorted(found, key=len, reverse=True)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from darswin.calibrate import edges
-from darswin.calibrate.boards import image_circle
+from darswin.calibrate.boards import LEAST_SIDE, image_circle
 from darswin.calibrate.inputs import CalibrationError
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
@@ -38,8 +38,6 @@ GROUPS = 8  # of curves; the answers without each of them show the uncertainty
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
-
-
 _cost = attrgetter("cost")
 
 
@@ -87,7 +85,7 @@ def estimate(
 
     Raises:
         CalibrationError: too few lines, or lines that do not determine the lens.
-        ValueError: an unknown model, or pictures of several sizes.
+        ValueError: an unknown model, or pictures of several sizes, or below 16 px.
     """
     if model not in MODELS and model != "Division":
         raise ValueError(unknown_model(model))
@@ -97,6 +95,8 @@ def estimate(
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
         raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
+    check("pictures", "{1} × {0} px".format(*min(sizes)), min(min(sizes)) >= LEAST_SIDE,
+          f"of at least {LEAST_SIDE} × {LEAST_SIDE} px")  # fmt: skip
     circle = image_circle(pictures)
     if fov is not None and circle is None:
         raise CalibrationError("no image circle is visible, so its field of view says nothing")

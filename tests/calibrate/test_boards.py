@@ -312,3 +312,17 @@ def test_pixels_per_unit_are_those_to_the_nearest_neighbour(board):
                 px, units = (math.dist(of[row, column], of[y, x]) for of in (grid, points))
                 least[row, column] = np.fmin(least[row, column], px / units)
     np.testing.assert_allclose(pixels_per_unit(grid, board), least)
+
+
+@pytest.mark.parametrize(
+    "size", [(0, 0), (0, 9), (1, 1), (3, 3), (40, 2), (15, 15), (16, 16), (17, 90)]
+)
+def test_small_pictures_show_nothing(size):
+    picture = np.random.default_rng(1).integers(0, 256, size).astype(np.uint8)
+    boards = (
+        Board.chessboard(3, 3, 1.0), Board.charuco(4, 3, 1.0, 0.5),
+        Board.april_grid(1, 1, 1.0, 0.3),
+    )  # fmt: skip
+    for board in boards:
+        assert np.isnan(find_corners(picture, board)).all()
+    assert image_circle([picture]) is None and image_circle([0 * picture]) is None

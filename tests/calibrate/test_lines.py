@@ -251,3 +251,16 @@ def test_wrong_arguments(arguments, message):
     given = {"pictures": [np.full((60, 80, 3), 90, np.uint8)]} | arguments
     with pytest.raises(ValueError, match=message):
         estimate(**given)
+
+
+@pytest.mark.parametrize("size", [(0, 0), (0, 20), (1, 1), (15, 40)])
+def test_small_pictures_are_refused(size):
+    with pytest.raises(ValueError, match="`pictures` must be of at least 16 × 16 px, got"):
+        estimate([np.zeros(size, np.uint8)])
+
+
+@pytest.mark.parametrize("size", [(16, 16), (17, 40), (64, 64)])
+def test_noise_has_too_few_lines(size):
+    noise = np.random.default_rng(0).integers(0, 256, size).astype(np.uint8)
+    with pytest.raises(CalibrationError, match="curves may be straight lines"):
+        estimate([noise])
