@@ -95,8 +95,8 @@ def estimate(
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
         raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
-    check("pictures", "{1} × {0} px".format(*min(sizes)), min(min(sizes)) >= LEAST_SIDE,
-          f"of at least {LEAST_SIDE} × {LEAST_SIDE} px")  # fmt: skip
+    if min(min(sizes)) < LEAST_SIDE:
+        raise ValueError(f"pictures must have at least {LEAST_SIDE} × {LEAST_SIDE} px")
     circle = image_circle(pictures)
     if fov is not None and circle is None:
         raise CalibrationError("no image circle is visible, so its field of view says nothing")

@@ -255,7 +255,7 @@ def test_wrong_arguments(arguments, message):
 
 @pytest.mark.parametrize("size", [(0, 0), (0, 20), (1, 1), (15, 40)])
 def test_small_pictures_are_refused(size):
-    with pytest.raises(ValueError, match="`pictures` must be of at least 16 × 16 px, got"):
+    with pytest.raises(ValueError, match="pictures must have at least 16 × 16 px"):
         estimate([np.zeros(size, np.uint8)])
 
 
