@@ -33,7 +33,12 @@ def parallel(fov, one_distance, noise):
 @pytest.mark.parametrize("fov", [60, 190])
 def test_boards_that_are_parallel_to_the_sensor(fov, one_distance, noise):
     with pytest.raises(CalibrationError, match="nearly parallel to the sensor: tilt them by 20 to"):
-        calibrate(parallel(fov, one_distance, noise), BOARD, SIZE)
+        calibrate(parallel(fov, one_distance, noise), BOARD, SIZE, "KannalaBrandt")
+
+
+def test_no_model_is_found_from_boards_that_are_parallel_to_the_sensor():
+    with pytest.raises(CalibrationError, match="nearly parallel to the sensor: tilt them by 20 to"):
+        calibrate(parallel(100, False, 0.2), BOARD, SIZE, "auto")
 
 
 ERRORS = {
@@ -93,14 +98,14 @@ def test_boards_at_one_distance_blurred_corners_and_few_pictures_are_doubted():
     found = calibrate(CORNERS[:1].expand(4, -1, -1), BOARD, SIZE, "Equidistant")
     assert [text for text in found.doubts if "one distance" in text]
     assert [text for text in found.doubts if text.startswith("4 pictures are few")]
-    blurred = calibrate(rig(TRUE.lens, 10, noise=2.0).corners, BOARD, SIZE)
+    blurred = calibrate(rig(TRUE.lens, 10, noise=2.0).corners, BOARD, SIZE, "KannalaBrandt")
     assert [text for text in blurred.doubts if "px off: the pictures are blurred" in text]
 
 
 def test_corners_in_the_middle_only_are_doubted():
     lens = true_lens("KannalaBrandt", 190, shift=0.0)
     narrow = rig(lens.with_theta_max(0.6), 12)
-    found = calibrate(narrow.corners, BOARD, SIZE)
+    found = calibrate(narrow.corners, BOARD, SIZE, "KannalaBrandt")
     assert math.degrees(found.supported) == pytest.approx(math.degrees(0.6), abs=2)
     assert [text for text in found.doubts if text.startswith("corners reach 3")]
 

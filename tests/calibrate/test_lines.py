@@ -174,6 +174,7 @@ def test_short_edges_of_a_board_in_many_poses_determine_a_narrow_lens():
     assert found.rim == pytest.approx(rim_of(lens), rel=0.03) and found.doubts == ()
 
 
+@pytest.mark.slow
 def test_an_interval_holds_the_truth_in_two_cases_of_three():
     misses = []
     for seed in range(12):

@@ -183,6 +183,7 @@ def test_models_that_the_format_cannot_hold_are_not_taken(folder, capsys, monkey
     assert type(lens.load(out)).__name__ == model
 
 
+@pytest.mark.slow
 def test_another_board_is_described(folder, capsys):
     line = refusal(capsys, "markers", *CHARUCO, "--dictionary=5X5_250")
     assert re.search("they show markers [0-4] to 14 of 4X4_", line)
