@@ -52,7 +52,9 @@ def test_a_written_file_reads_back_to_the_same_lens_or_is_refused(name, data, tm
     theta = 0.3 * torch.linspace(0, 1, 15, dtype=f64)
     azimuth = torch.linspace(-3, 3, 15, dtype=f64)
     for form, suffixes in FORMATS.items():
-        path = tmp_path_factory.getbasetemp() / f"lens{data.draw(st.sampled_from(suffixes))}"
+        folder = tmp_path_factory.getbasetemp() / "written"  # other tests look above theirs
+        folder.mkdir(exist_ok=True)
+        path = folder / f"lens{data.draw(st.sampled_from(suffixes))}"
         try:
             assert save(lens, path, form) == form
         except ValueError as error:
