@@ -210,7 +210,10 @@ def published(camera: str) -> Lens:
         return kinds.load(DATA / "left_intrinsics.yml").to(torch.float64)
     file = cv2.FileStorage(str(DATA / "intrinsics.yml"), cv2.FILE_STORAGE_READ)
     matrix, (k1, k2, p1, p2, k3) = file.getNode("M2").mat(), file.getNode("D2").mat().ravel()[:5]
-    t = lambda *numbers: torch.tensor([numbers], dtype=torch.float64)  # noqa: E731
+
+    def t(*numbers: float) -> torch.Tensor:
+        return torch.tensor([numbers], dtype=torch.float64)
+
     return kinds.BrownConrady(
         focal=t(matrix[0, 0])[0], radial=t(k1, k2, k3), tangential=t(p1, p2),
         center=t(*matrix[:2, 2]), image_size=SIZE,

@@ -50,7 +50,11 @@ def test_digits_need_the_true_lens():
 
 def test_a_search_runs_once_for_some_curves_and_is_forgotten(monkeypatch):
     ran, search = [], lines._search
-    counted = lambda of: ran.append(of) or search(of)  # noqa: E731
+
+    def counted(of):
+        ran.append(of)
+        return search(of)
+
     monkeypatch.setattr(lines, "_search", counted)
     found = [study.curves(draw_rooms(ROOMS, 2)[0])]
     known = lines.from_curves(found, study.SIZE, "Division")
