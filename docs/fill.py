@@ -8,7 +8,7 @@ import json
 import re
 import statistics
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -25,13 +25,8 @@ PAGES = [
     ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), RESULTS / "missed_targets.md",
 ]  # fmt: skip
 
-# The CPUs that there are records of, by the end of their names; the pages show the first one that
-# has a record of a suite.
-CPUS = {
-    "intel-r-xeon-r-6-167-avx512": "Xeon",
-    "amd-epyc-25-17-avx512": "Zen 4",
-    "amd-epyc-avx512": "Zen 5",
-}
+# The CPUs that there are records of, by the end of their names; the pages show the first one.
+CPUS = {"amd-epyc-25-1-avx2": "AMD EPYC (Zen 3)"}
 SUITES = ("sampling", "to_image", "attention", "model", "one_frame", "frames")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
@@ -59,6 +54,48 @@ def records(suite: str) -> dict[str, Record]:
     """Of a suite, by CPU."""
     paths = {name: RESULTS / f"{suite}--{cpu}.json" for cpu, name in CPUS.items()}
     return {name: Record.load(path) for name, path in paths.items() if path.exists()}
+
+
+def machine_line(suites: Mapping[str, Record]) -> str:
+    """Sentences on the machine of the first CPU; its records must be of one commit."""
+    heads = {suite: record.machine for suite, record in suites.items()}
+    head = heads["sampling"]
+    for suite, other in heads.items():
+        for key in ("cpu", "tier", "cores", "torch", "commit"):
+            assert other[key] == head[key], (suite, key, other[key], head[key])
+    assert not head["commit"].endswith("dirty")
+    return (
+        f"The measurements are from {head['cores']} cores of an {head['cpu']}, on the tier "
+        f"`{head['tier']}`.\nThey use torch {head['torch'].split('+')[0]} and the code of commit "
+        f"{head['commit']}."
+    )
+
+
+def missed_line(timings: Sequence[Timing]) -> str:
+    """Sentences on how many targets of each operator are missed, and how many rows a peer wins."""
+    with_target = [t for t in timings if t.target is not None]
+    counts = []
+    for operator in dict.fromkeys(t.subject.partition(",")[0] for t in with_target):
+        chosen = [t for t in with_target if t.subject.partition(",")[0] == operator]
+        counts.append(f"{sum(t.missed for t in chosen)} of {len(chosen)} for `{operator}`")
+    lost = [t for t in with_target if t.ratio < 1 and not t.name.startswith(OURS)]
+    return (
+        f"On this CPU the operators miss {', '.join(counts[:-1])} and {counts[-1]}.\n"
+        + (
+            f"A peer is faster than the operator in {len(lost)} of these rows."
+            if lost
+            else "They are faster than the peer in every row."
+        )
+    )
+
+
+def loader_line(rates: Mapping[str, float]) -> str:
+    one, two = (f"{rates[f'{n} worker processes']:.0f}" for n in (1, 2))
+    return (
+        f"One core prepares {rates['all']:.0f} such images per second.\n"
+        f"One worker process beside the training prepares {one} images per second, and two prepare "
+        f"{two}."
+    )
 
 
 def drop_in_line(timings: Sequence[Timing]) -> str:
@@ -144,9 +181,8 @@ def tables() -> dict[str, str]:
 
     studies = ROOT / "studies" / "results"
     suites = {suite: records(suite) for suite in SUITES}
-    sampling, to_image, attention, model, one_frame, frames = (
-        next(iter(suites[suite].values())) for suite in SUITES
-    )
+    first = {suite: next(iter(found.values())) for suite, found in suites.items()}
+    sampling, to_image, attention, model, one_frame, frames = first.values()
     cpus = {
         cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
         for cpu in CPUS.values()
@@ -167,8 +203,10 @@ def tables() -> dict[str, str]:
         "demo": demo_table(demo),
         "demo line": demo_line(demo),
         "drop-in": drop_in_line(sampling.timings),
-        "speed": peers.best_table({cpu: cpus[cpu] for cpu in ("Xeon", "Zen 4")}, README_SPEED),
+        "machine line": machine_line(first),
+        "speed": peers.best_table(cpus, README_SPEED),
         "cpus": peers.best_table(cpus, SPEED),
+        "missed line": missed_line([*sampling.timings, *to_image.timings, *attention.timings]),
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
         "frame line": frame_line(one_frame.timings),
@@ -190,6 +228,7 @@ def tables() -> dict[str, str]:
         ),
         "attention": peers.attention_table(attention.timings),
         "training": peers.training_table(training["models"]),
+        "loader line": loader_line(training["loader"]),
         **study.tables(cells),
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),

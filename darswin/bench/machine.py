@@ -86,5 +86,10 @@ def _commit() -> str:
     root = Path(__file__).parent.parent.parent
     if not (root / ".git").exists():
         return ""
-    command = ["git", "describe", "--always", "--dirty"]
-    return subprocess.run(command, cwd=root, capture_output=True, text=True).stdout.strip()
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True).stdout
+
+    # The records of a run, which are written one by one, are no change of the code.
+    changes = git("status", "--porcelain", "-uno", "--", ".", ":!benchmarks/results")
+    return git("describe", "--always").strip() + "-dirty" * bool(changes)
