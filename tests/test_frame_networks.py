@@ -305,6 +305,7 @@ def opens(path, frame, expected):
     return True
 
 
+@pytest.mark.slow
 def test_damaged_files_are_refused_or_harmless(small, tmp_path):
     content, frame, expected = small
     path, rng = tmp_path / "camera.npz", np.random.default_rng(0)
@@ -338,6 +339,7 @@ def test_files_that_end_too_early_are_refused(small, tmp_path):
     assert not opens(path, frame, expected)
 
 
+@pytest.mark.slow
 def test_programs_that_were_not_written_do_no_harm(small, tmp_path):
     """Even if the archive around them is whole."""
     content, frame, _ = small

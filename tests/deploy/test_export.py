@@ -199,6 +199,7 @@ def translated(monkeypatch):
     return sizes
 
 
+@pytest.mark.slow
 def test_each_block_is_traced_once(translated, monkeypatch):
     pytest.importorskip("onnxscript")
     model, images, blocks = create_model("darswin_a_nano").eval(), torch.zeros(1, 3, 64, 64), []
@@ -216,6 +217,7 @@ def test_each_block_is_traced_once(translated, monkeypatch):
         blocks.clear()
 
 
+@pytest.mark.slow
 def test_a_fixed_lens_is_solved_before_the_graph_begins(translated):
     pytest.importorskip("onnxscript")
     model, images = short("conv_unet_nano", task="distance"), torch.zeros(1, 3, 32, 32)

@@ -128,6 +128,7 @@ def test_a_loss_that_is_not_finite_is_told_where_lightning_logs(monkeypatch):
                 task.training_step(([0],), step)
 
 
+@pytest.mark.slow
 def test_launches_of_darswin_a_small():
     model, lenses = network("darswin_a_small", num_classes=10), SPHERICAL.to("meta")
     with torch.no_grad():

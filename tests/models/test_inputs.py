@@ -132,6 +132,7 @@ def test_only_the_first_calls_look_at_the_values():
     assert len(told(lambda: optimize(made("darswin_a_nano")[0])(frames.float(), lens))) == 1
 
 
+@pytest.mark.slow
 def test_graphs_and_gradients_do_not_see_the_look():
     model, frames, lens = made("darswin_a_nano")
     pixels = frames.float()

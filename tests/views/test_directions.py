@@ -178,6 +178,7 @@ def test_pixels_are_means_of_their_points(name):
     assert (large, small) == (1, 4)
 
 
+@pytest.mark.slow
 def test_views_of_many_lenses_are_those_of_each():
     lenses = Equidistant([100.0, 150.0, 400.0], [1.9, 1.5, 1.2])
     for name in RAY_VIEWS:
