@@ -37,9 +37,12 @@ def product(*tables):
     ]
 
 
-def slow_but(names, *fast):
-    """The names, for `parametrize`: all but some are slow."""
-    return [name if name in fast else pytest.param(name, marks=slow) for name in names]
+def slow_but(rows, *fast):
+    """The rows, for `parametrize`: all but some are slow."""
+    return [
+        pytest.param(*(row if isinstance(row, tuple) else [row]), marks=[] if row in fast else slow)
+        for row in rows
+    ]
 
 
 FIXTURES = Path(__file__).parent / "fixtures"

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import slow_but
 from lens_examples import ASIDE, example
 
 from darswin import create_model
@@ -51,6 +52,8 @@ KINDS = {
     "official": (None, {}),
     "adapter": (None, {}),
 }
+# One of each view and of each network, which are traced in a second.
+FAST = ("fixed angle", "conv whole lens", "unet", "unet without skip", "official", "adapter")
 
 
 def model_of(kind):
@@ -124,7 +127,7 @@ def check(kind, lens_name, written, input, fixed, path):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_but(KINDS, *FAST))
 def test_the_program_of_every_model(kind, tmp_path):
     lens = "KannalaBrandt" if kind == "official" else "KannalaBrandt, general"
     check(kind, lens, "program", "images", True, tmp_path / "model.onnx")

@@ -27,7 +27,7 @@ CASES = [
 
 def cost(case):
     """Marks the larger sizes of a model as slow: they differ from the smaller in numbers alone."""
-    large = case.endswith(("small", "tiny", "small backbone", "tiny backbone"))
+    large = "nano" not in case and "adapter" not in case
     return pytest.param(case, marks=[pytest.mark.slow] if large else [])
 
 

@@ -173,6 +173,7 @@ def colmap_pixels(model, params, points):
     return distorted(u, v, plane, **terms)
 
 
+@pytest.mark.slow
 def test_every_model_of_colmap():
     path = FILES / "colmap_all.txt"
     found = load_all(path, theta_max=0.3, dtype=f64)

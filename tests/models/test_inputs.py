@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from helpers import network, side_of
+from helpers import network, product, side_of
 from torch import nn
 
 from darswin import PolarView, list_models, optimize
@@ -106,8 +106,9 @@ def told(call):
 
 
 @torch.no_grad()
-@models
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("kind", "dtype"), product(MODELS, [torch.float32, torch.float64, torch.bfloat16])
+)
 def test_a_model_tells_once_that_floats_are_no_pixels(kind, dtype):
     model, frames, lens = made(kind, mean=MEAN, std=STD)
     model = model.to(dtype)

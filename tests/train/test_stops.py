@@ -131,7 +131,7 @@ def test_a_least_number_of_epochs_holds_against_time_and_not_against_signals(tmp
     assert checkpoint(tmp_path / "signal")["global_step"] == 1
 
 
-@pytest.mark.parametrize("how", ["time", "signal"])
+@pytest.mark.parametrize("how", ["signal", pytest.param("time", marks=slow)])
 def test_a_stop_during_a_validation(wholes, tmp_path, monkeypatch, how):
     run, whole = tmp_path / "run", wholes("accumulated")
 
