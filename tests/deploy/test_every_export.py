@@ -133,7 +133,12 @@ def test_the_program_of_every_model(kind, tmp_path):
     check(kind, lens, "program", "images", True, tmp_path / "model.onnx")
 
 
-@pytest.mark.parametrize("lens", ["Tabulated", "KannalaBrandt, general", "affine alone, general"])
+@pytest.mark.parametrize(
+    "lens",
+    slow_but(
+        ["Tabulated", "KannalaBrandt, general", "affine alone, general"], "affine alone, general"
+    ),
+)
 def test_the_program_of_a_dense_model_with_rays(lens, tmp_path):
     check("conv", lens, "program", "images", False, tmp_path / "model.onnx")
 

@@ -35,35 +35,6 @@ def test_radii_of_calibrations_to_a_thousandth_of_a_pixel(name, camera):
     torch.testing.assert_close(lens.project(DEGREES.deg2rad()), expected, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "model", "center", "size"),
-    [
-        ("woodscape.json", "Polynomial", (640 + 1.8 - 0.5, 483 + 3.6 - 0.5), (966, 1280)),
-        ("kitti360_02.yaml", "Mei", (708.5, 697.0), (1400, 1400)),
-        ("camodocal_pinhole.yaml", "BrownConrady", (371.4, 236.2), (480, 752)),
-        ("kalibr_ds.yaml", "DoubleSphere", (724.6, 533.8), (1080, 1440)),
-        ("kalibr_omni.yaml", "Mei", (380.6, 243.5), (480, 752)),
-        ("ros_plumb_bob.yaml", "BrownConrady", (312.054718, 236.418205), (480, 640)),
-        ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
-        ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
-        ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
-        # The row comes first, and indices begin at 0.
-        ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
-        # The center of the upper left pixel is (0.5, 0.5).
-        ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
-        ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),
-        ("ours.json", "KannalaBrandt", (319.5, 241.0), (480, 640)),
-    ],
-)
-def test_each_format_keeps_its_pixel_origin(name, model, center, size):
-    lens = load(FILES / name, dtype=f64)
-    assert type(lens).__name__ == model and len(lens) == 1
-    assert lens.center.tolist() == [pytest.approx(center, abs=1e-12)]
-    assert lens.image_size.tolist() == [list(size)]
-    assert lens.theta_max.dtype == f64
-    assert load(FILES / name).theta_max.dtype == torch.float32
-
-
 def write(path, **entries):
     """A file written by OpenCV's FileStorage, in the notation of its suffix."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
