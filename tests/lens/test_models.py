@@ -18,18 +18,15 @@ from darswin.lens import (
     Lens,
     Mei,
     OCam,
-    OCamInverse,
     Perspective,
     Polynomial,
     Spherical,
     Stereographic,
     Tabulated,
-    from_dict,
     solve,
     to_dict,
 )
 from darswin.lens.ideal import FocalLens
-from darswin.lens.orientation import rotated
 from darswin.lens.solve import direction_of
 
 
@@ -235,36 +232,6 @@ def test_a_value_out_of_range_is_named(make, said):
     with pytest.raises(ValueError) as error:
         make()
     assert said in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "name", "degrees"),
-    [
-        (lambda: Equidistant.from_fov(170, 100), "fov", 170),
-        (lambda: Perspective.from_fov(fov=170, radius=100), "fov", 170),
-        (lambda: Spherical.from_fov(0.5, torch.tensor([1.0, 170.0]), 100), "fov", 170),
-        (lambda: from_dict({"model": "Stereographic", "fov": 170}, (480, 640)), "fov", 170),
-        (lambda: from_dict({"model": "Equidistant", "focal": 9, "theta_max": 85}), "theta_max", 85),
-        (lambda: KannalaBrandt(100, [0.1], theta_max=85), "theta_max", 85),
-        (lambda: OCamInverse([150.0, 90.0], 85), "theta_max", 85),
-        (lambda: Polynomial([1.0], [0.5, 85.0]), "theta_max", 85),
-        (lambda: Equidistant(100).with_theta_max(85), "theta_max", 85),
-        (lambda: FieldOfView(57, 100), "omega", 57),
-        (lambda: Tabulated([0.0, 45.0, 90.0], [0.0, 100.0, 190.0]), "angles", 90),
-        (lambda: rotated(Equidistant(100, center=(5, 5)), -90), "angle", -90),
-    ],
-)  # fmt: skip
-def test_an_angle_in_degrees_is_named_and_converted(make, name, degrees):
-    with pytest.raises(ValueError) as error:
-        make()
-    assert str(error.value).startswith(f"{name} must be")
-    assert f"{degrees}° is {math.radians(degrees):.4g}" in str(error.value)
-
-
-def test_an_angle_that_is_only_too_wide_is_not_taken_for_degrees():
-    with pytest.raises(ValueError, match=r"theta_max must be at most 1\.57") as error:
-        Perspective(100, 1.6)
-    assert "angles are" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", MODELS)

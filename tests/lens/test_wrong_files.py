@@ -19,7 +19,7 @@ from lens_examples import (
     sized,
 )  # fmt: skip
 
-from darswin.lens import Orthographic, from_dict, load_all
+from darswin.lens import from_dict, load_all
 
 K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 D = [-0.3, 0.1, 0.001, -0.002, 0.01]
@@ -320,15 +320,6 @@ def test_errors_say_what_is_wrong(case):
 def test_dicts_are_refused_like_files(entries, said):
     with pytest.raises(ValueError, match=said):
         from_dict(dict(model="Equidistant") | entries, (100, 100))
-
-
-def test_only_an_angle_far_beyond_the_limit_is_taken_for_degrees():
-    for fov in (3.2, 6.283, 6.5):
-        with pytest.raises(ValueError, match="fov must be at most") as error:
-            Orthographic.from_fov(fov, 50.0)
-        assert "radians" not in str(error.value)
-    with pytest.raises(ValueError, match=r"170° is 2\.967"):
-        Orthographic.from_fov(170.0, 50.0)
 
 
 # -- hostile and large files --------------------------------------------------------------------
