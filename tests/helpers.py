@@ -1,9 +1,11 @@
 """Helpers for several test files."""
 
 import contextlib
+import itertools
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from safetensors.torch import load_file
 
@@ -12,6 +14,7 @@ from darswin.compat import OfficialDarSwin, OfficialPolynomial
 from darswin.lens import Mei, Polynomial, Spherical
 from darswin.models.registry import has_image_size
 
+slow = pytest.mark.slow
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 
 
@@ -20,6 +23,26 @@ def changed(name: str, old: str, new: str) -> str:
     text = CALIBRATIONS.joinpath(name).read_text()
     assert old in text
     return text.replace(old, new)
+
+
+def product(*tables):
+    """The rows of a product of tables, for `parametrize`: a few have each value of each table once,
+    and the others are slow."""
+    tables = [list(table) for table in tables]
+    longest = max(map(len, tables))
+    fast = {tuple(k % len(table) for table in tables) for k in range(longest)}
+    return [
+        pytest.param(*map(list.__getitem__, tables, row), marks=[] if row in fast else slow)
+        for row in itertools.product(*(range(len(table)) for table in tables))
+    ]
+
+
+def slow_but(rows, *fast):
+    """The rows, for `parametrize`: all but some are slow."""
+    return [
+        pytest.param(*(row if isinstance(row, tuple) else [row]), marks=[] if row in fast else slow)
+        for row in rows
+    ]
 
 
 FIXTURES = Path(__file__).parent / "fixtures"

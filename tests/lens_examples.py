@@ -56,6 +56,7 @@ def double(*values):
 K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
 FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
 PLUMB_BOB = [-0.22, 0.05, 0.001, -0.002, 0.003]
+RATIONAL = [0.2, 0.05, 0.001, -0.002, 0.003, 0.25, 0.04, 0.002]
 
 
 def opencv(**entries):
@@ -77,6 +78,50 @@ def message(binning=(0, 0), roi=(0, 0, 0, 0)):
              roi=dict(sides, do_rectify=False))
     )  # fmt: skip
 
+
+def sized(**entries):
+    """A fisheye whose size is given by the entries."""
+    return json.dumps(dict(K=K, D=FISHEYE, fisheye=1) | entries)
+
+
+def _by_name(d, first=1, **plane):
+    return {f"k{i}": value for i, value in enumerate(d, first)} | plane
+
+
+_PINHOLE = dict(camera_model="pinhole", distortion_model="equidistant", resolution=[1280, 960],
+                intrinsics=[421.3, 420.9, 643.1, 478.6])  # fmt: skip
+NGP = json.loads(file_text("instant_ngp.json"))
+# What other cameras of instant-ngp have.
+OTHER_CAMERAS = (
+    dict(ftheta_p0=0.0, ftheta_p1=0.001, ftheta_p2=0), dict(ftheta_p4="1e-9"), dict(latlong=True),
+    dict(equirectangular=1), dict(is_orthographic="True"), dict(isLatLong="yes"),
+)  # fmt: skip
+
+
+def instant_ngp(**entries):
+    """A file of instant-ngp with other entries; None leaves an entry out."""
+    return json.dumps({name: v for name, v in (NGP | entries).items() if v is not None})
+
+
+# A camera with the coefficients of a fisheye, in each form that has them.
+FISHEYES = {
+    "ROS": lambda d: yaml.safe_dump(
+        yaml.safe_load(message()) | dict(distortion_model="equidistant", d=d)),
+    "matrix": lambda d: opencv(D={"rows": len(d), "cols": 1, "data": d}, fisheye=1),
+    "rows": lambda d: opencv(D=[[value] for value in d], fisheye_model=1),
+    "text": lambda d: opencv(dist_coeffs=" ".join(map(str, d)), model="equidistant"),
+    "Kalibr": lambda d: json.dumps({"cam0": _PINHOLE | dict(distortion_coeffs=d)}),
+    "EuRoC": lambda d: json.dumps(_PINHOLE | dict(distortion_coefficients=d)),
+    "by name": lambda d: flat(**_by_name(d), model="fisheye"),
+    "CamOdoCal": lambda d: json.dumps(dict(
+        model_type="KANNALA_BRANDT", image_width=1280, image_height=960,
+        projection_parameters=_by_name(d, 2, mu=421.3, mv=420.9, u0=643.1, v0=478.6))),
+    "nerfstudio": lambda d: json.dumps(
+        _by_name(d, fl_x=421.3, fl_y=420.9, cx=643.6, cy=479.1, w=1280, h=960)
+        | dict(camera_model="OPENCV_FISHEYE")),
+    "basalt": lambda d: json.dumps(dict(value0=dict(resolution=[[1280, 960]], intrinsics=[dict(
+        camera_type="kb4", intrinsics=_by_name(d, fx=421.3, fy=420.9, cx=643.1, cy=478.6))]))),
+}  # fmt: skip
 
 FRONT = Polynomial(
     [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1], image_size=(966, 1280)

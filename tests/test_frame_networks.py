@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
+from helpers import product
 from torch import nn
 
 from darswin import create_model, frames, list_models, optimize
@@ -89,9 +90,9 @@ def assert_close(found, expected, of=1e-5):
         np.testing.assert_allclose(one, other, rtol=of, atol=of * np.abs(other).max())
 
 
-@pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize(("family", "options"), CASES, ids=str)
-def test_a_network_gives_what_its_model_gives(family, options, lens, tmp_path):
+@pytest.mark.parametrize(("case", "lens"), product(CASES, LENSES), ids=str)
+def test_a_network_gives_what_its_model_gives(case, lens, tmp_path):
+    family, options = case
     for channels in (3, 1) if lens == "round" else (3,):
         model = model_of(family, channels, **options)
         network = network_of(model, tmp_path, LENSES[lens])
@@ -115,14 +116,10 @@ def quantized_of(model):
     return quantize_model(model, [(pictures, ROUND)])
 
 
-@pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize(
-    ("family", "options"),
-    [*((name, {}) for name in FAMILIES), ("darswin_a", dict(features_only=True))],
-    ids=str,
-)
-def test_quantized_networks_compute_with_8_bits(family, options, own, tmp_path, monkeypatch):
-    model = model_of(family, **options)
+@pytest.mark.parametrize(("family", "own"), product([*FAMILIES, "maps"], [True, False]))
+def test_quantized_networks_compute_with_8_bits(family, own, tmp_path, monkeypatch):
+    maps = dict(family="darswin_a", features_only=True)
+    model = model_of(**maps if family == "maps" else dict(family=family))
     quantized = quantized_of(model)
     expected_of = optimize(quantized, torch.int8)
     monkeypatch.setattr(packed, "has_own_int8", lambda: own)  # False: this CPU has AMX
@@ -305,6 +302,7 @@ def opens(path, frame, expected):
     return True
 
 
+@pytest.mark.slow
 def test_damaged_files_are_refused_or_harmless(small, tmp_path):
     content, frame, expected = small
     path, rng = tmp_path / "camera.npz", np.random.default_rng(0)
@@ -338,6 +336,7 @@ def test_files_that_end_too_early_are_refused(small, tmp_path):
     assert not opens(path, frame, expected)
 
 
+@pytest.mark.slow
 def test_programs_that_were_not_written_do_no_harm(small, tmp_path):
     """Even if the archive around them is whole."""
     content, frame, _ = small

@@ -17,13 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import RANDOM, random_lens
 
-from darswin import create_model, frames, list_models
+from darswin import create_model, frames
 from darswin.compat import OfficialDarSwin
 from darswin.frames import _frames, plans
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
-from darswin.models.encoder import Encoder
-from darswin.models.registry import model_class
 from darswin.views import PolarView, make_view
 
 
@@ -89,53 +87,6 @@ def test_a_polar_picture():
     plain = frames.Sampler(frames.plan(layer(layout="image", mean=0.0, std=1.0), ROUND, (64, 64)))
     assert picture.shape == (8, 24, 3)
     assert np.abs(picture - 255 * plain(frame).transpose(1, 2, 0)).max() <= 0.5 + 1e-3
-
-
-def without_size(names):
-    return sorted({name.rpartition("_")[0] for name in names})
-
-
-FAMILIES = without_size(list_models())
-ENCODERS = [f for f in FAMILIES if issubclass(model_class(f"{f}_nano"), Encoder)]
-AS_THEY_ARE = {"swin", "dat", "swin_unet", "conv_unet"}  # these take images as they are
-SAMPLING = [
-    *((family, {}) for family in FAMILIES if family not in AS_THEY_ARE),
-    *((family, dict(features_only=True)) for family in ENCODERS if family not in AS_THEY_ARE),
-    ("darswin_unet_a", dict(task="distance")),
-    ("swin_unet_undis", dict(task="distance")),
-    ("conv_unet", dict(view="mercator", size=(40, 30))),
-    ("swin_unet", dict(view="equirectangular", fov=2.8)),
-]
-
-
-@pytest.mark.parametrize(("family", "options"), SAMPLING, ids=str)
-@pytest.mark.parametrize("channels", [3, 1])
-def test_a_model_gets_what_it_samples_itself(family, options, channels):
-    mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
-    model = create_model(f"{family}_nano", mean=mean, std=std, in_chans=channels, **options).eval()
-    size = model.image_size or (70, 80)
-    lens = Equidistant.from_fov(2.8, 30.0)
-    frame = random_frame(*size, channels)
-    images = torch.from_numpy(frame).permute(2, 0, 1)[None]
-    with torch.inference_mode():
-        prepared = model.prepare(lens, size)
-        sampled = frames.Sampler(frames.plan(model, lens, size))(frame)[None]
-        expected = model.sample(images, prepared)
-        np.testing.assert_allclose(sampled, expected.numpy(), rtol=1e-4, atol=1e-4)
-        pixels = images if model.refines_with_images else None
-        result = model.run_sampled(torch.from_numpy(sampled), prepared, pixels)
-        torch.testing.assert_close(result, model.run(images, prepared), rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("features_only", [False, True])
-@pytest.mark.parametrize("family", sorted(AS_THEY_ARE))
-def test_models_that_take_images_as_they_are_need_no_plan(family, features_only):
-    if features_only and family not in ENCODERS:
-        return
-    options = dict(features_only=True) if features_only else {}
-    model = create_model(f"{family}_nano", **options)
-    with pytest.raises(ValueError, match="needs no plan"):
-        frames.plan(model, ROUND, model.image_size or (64, 64))
 
 
 def test_an_adapter_gets_what_it_samples_itself():

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import dense_cells
 import pytest
 import quantized
 import study
@@ -28,6 +29,10 @@ def test_cells_have_folders_of_their_own_and_make_models():
     assert len({cell.key for cell in cells}) == len({cell.identity for cell in cells}) == len(cells)
     for cell in ablations(1):
         create_model(f"{cell.family}_nano", num_classes=10, in_chans=1, **cell.options)
+    dense = dense_cells.all_cells(3)
+    expected = len(dense_cells.STUDIED_MODELS) * 3 + len(dense_cells.CONTROLLED)
+    assert len({cell.key for cell in dense}) == len(dense) == len(dense_cells.STUDIED) * expected
+    assert len(dense) == 104 and dense[0].key == "darswin-unet-ra-wide-segmentation-0"
 
 
 JOBS = """
@@ -108,6 +113,7 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
     assert again["accuracy"] == cells["swin-low-0"]["accuracy"]
 
 
+@pytest.mark.slow
 def test_cells_of_a_record_are_not_run_again(here, tmp_path, monkeypatch):
     ran = []
 
@@ -168,6 +174,7 @@ def test_cells_of_8_bits(quick, here):
         quantized.main([*how, "--pictures", "9", *QUICK])
 
 
+@pytest.mark.slow
 def test_what_8_bits_lose():
     def cell(label: str, seed: int, after: list[float], changed: float) -> dict:
         accuracy = dict(float32=dict.fromkeys(SWEEP, 50.0), int8=dict.fromkeys(SWEEP, 50.0))

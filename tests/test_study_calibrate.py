@@ -29,6 +29,7 @@ EXACT = {
 }
 
 
+@pytest.mark.slow
 def test_errors_do_not_depend_on_the_frame_nor_on_a_few_wrong_rays():
     true = torch.nn.functional.normalize(torch.randn(100, 3, dtype=torch.float64), dim=1).numpy()
     turned = true @ turn(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)).numpy()
@@ -51,6 +52,7 @@ def test_every_model_has_sets_with_all_numbers_of_pictures():
     assert fovs("Perspective") == [60, 100, 150] and fovs("KannalaBrandt") == [*FOVS]
 
 
+@pytest.mark.slow
 def test_the_truth_is_what_the_corners_come_from():
     given, rays = make(Set("Spherical", 150, 3, noise=0.0), 4)
     assert given.corners.shape == (3, 54, 2) and given.pixels.shape == (len(rays), 2)
@@ -61,6 +63,7 @@ def test_the_truth_is_what_the_corners_come_from():
         given.within(5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=[pytest.mark.slow] if n in NEEDS else []) for n in EXACT]
 )
@@ -73,6 +76,7 @@ def test_a_method_finds_a_lens_of_its_model(name):
     assert np.median(ray_errors(METHODS[name](given), true)) < limit
 
 
+@pytest.mark.slow
 def test_a_picture_left_out_is_missed_only_by_a_wrong_lens():
     true = BrownConrady(
         500.0, (-0.2, 0.05, 0.0), tangential=(1e-3, -1e-3), center=(310.0, 250.0),
@@ -93,6 +97,7 @@ def test_a_picture_left_out_is_missed_only_by_a_wrong_lens():
     assert max(found) < 1e-3 and fits == [(3, (480, 640))] * 4
 
 
+@pytest.mark.slow
 def test_a_run_is_recorded_and_its_tables_are_made(tmp_path, monkeypatch):
     def fails(_):
         raise FailedError("too few pictures")
@@ -123,6 +128,7 @@ def test_a_run_is_recorded_and_its_tables_are_made(tmp_path, monkeypatch):
     assert calibrate_tables.tables(None) == dict.fromkeys(made, calibrate_tables.NOT_RUN)
 
 
+@pytest.mark.slow
 def test_the_table_of_real_pictures_names_what_fails():
     one = dict(model="OCam", left_out=[3.0, 4.0], median=0.1, most=0.2)
     results = {AUTO: one, "other": one | dict(left_out=[3.0, None])}

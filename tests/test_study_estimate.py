@@ -29,6 +29,7 @@ def draw_rooms(name, count):
     return [picture.astype(np.uint8) for picture in [*pictures, np.zeros((*study.SIZE, 3))]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", study.LENSES)
 def test_true_lenses_have_the_field_of_view_of_the_study(name):
     _, _, fov, circle = study.LENSES[name]
@@ -40,6 +41,7 @@ def test_true_lenses_have_the_field_of_view_of_the_study(name):
     assert 0 < off.max() < study.SHIFT and lens.image_size.tolist() == [[*study.SIZE]]
 
 
+@pytest.mark.slow
 def test_digits_need_the_true_lens():
     true = study.lens_of("Spherical, ξ = 0.8")
     digits = study.Digits(true)
@@ -48,6 +50,7 @@ def test_digits_need_the_true_lens():
     assert wrong["perspective"] < 80 and wrong["equidistant, 180°"] < 94
 
 
+@pytest.mark.slow
 def test_a_search_runs_once_for_some_curves_and_is_forgotten(monkeypatch):
     ran, search = [], lines._search
 
@@ -68,6 +71,7 @@ def test_a_search_runs_once_for_some_curves_and_is_forgotten(monkeypatch):
     assert lines._search is counted
 
 
+@pytest.mark.slow
 def test_a_study_of_one_lens(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "pictures_of", draw_rooms)
     monkeypatch.setattr(study, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])

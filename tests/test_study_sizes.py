@@ -24,6 +24,7 @@ from sizes_scene import (
 QUICK = ["--pictures", "4", "2", "--processes", "1", "--seeds", "1"]
 
 
+@pytest.mark.slow
 def test_a_ball_alone_has_the_angular_size_of_its_distance(monkeypatch):
     lens = LENSES["140°"]()
     monkeypatch.setattr("sizes_scene.DENSITY", 1e-9)  # one ball
@@ -40,6 +41,7 @@ def test_a_ball_alone_has_the_angular_size_of_its_distance(monkeypatch):
         assert image[known].mean() > image[~known].mean()
 
 
+@pytest.mark.slow
 def test_pictures_are_the_same_again_and_small_balls_are_unknown():
     images, distances = pictures(OWN, 5, 2, 4)
     again, _ = pictures(OWN, 5, 3, 4)
@@ -60,6 +62,7 @@ def test_wrong_lenses_scale_the_angle_of_each_pixel():
         )
 
 
+@pytest.mark.slow
 def test_every_method_measures_through_every_lens():
     images = torch.from_numpy(pictures(OWN, 2, 0, 2)[0])
     for name, method in METHODS.items():
@@ -74,6 +77,7 @@ def test_every_method_measures_through_every_lens():
         assert torch.equal(results[0], results[1]) != method.uses_lens, name
 
 
+@pytest.mark.slow
 def test_cells_are_run_once_and_collected(tmp_path, monkeypatch):
     monkeypatch.setattr(sizes, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
     where = ["--out", str(tmp_path / "out"), "--results", str(tmp_path)]

@@ -94,6 +94,7 @@ def test_a_box_has_exact_labels_and_distances(box):
     assert hits.label[0] == LABEL["sky"] and np.isinf(hits.distance[0])
 
 
+@pytest.mark.slow
 def test_a_wall_shows_its_texture_upright_and_not_mirrored(box):
     """Seen from inside: texel (0, 0) is at the upper left, at each wall's start."""
     at = eye(128, 64, 64)
@@ -105,6 +106,7 @@ def test_a_wall_shows_its_texture_upright_and_not_mirrored(box):
     np.testing.assert_array_equal(hits.colour, palette[[10, 20, 30, 40]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lens",
     [
@@ -143,6 +145,7 @@ def test_distance_is_that_of_planes(box, lens):
     assert (view.distance[view.labels == LABEL["sky"]] == 0).all()
 
 
+@pytest.mark.slow
 def test_rotations_are_those_of_a_camera_and_colours_linear():
     rotation = poses.look(0.3, 0.2, 0.1)
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
@@ -156,6 +159,7 @@ def test_rotations_are_those_of_a_camera_and_colours_linear():
     assert render.to_srgb(np.array([0.5])) == 188
 
 
+@pytest.mark.slow
 def test_outlines_with_holes_and_gaps_are_filled():
     def sides(corners):
         return np.stack((corners, np.roll(corners, -1, 0)), 1).astype(float)
@@ -227,6 +231,7 @@ def test_a_data_set_is_the_same_bits_from_the_seed(tmp_path):
         dataset.write_map(*job[:3], 64, *job[4:])
 
 
+@pytest.mark.slow
 def test_real_cameras_are_cut_to_a_square_and_a_missing_game_is_named():
     name = str(ROOT / "tests" / "lens" / "files" / "woodscape.json")
     lens = draw_lens(name, 128, 2.9, np.random.default_rng(0))

@@ -49,6 +49,7 @@ def test_peers(operators, drawn, tmp_path):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("picture", sorted(RESULTS.glob("*.png")), ids=lambda path: path.stem)
 def test_the_pictures_of_the_records_can_be_read(picture, monkeypatch):
     """The text is large enough, the page is not endless, and the text lies inside."""

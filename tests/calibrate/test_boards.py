@@ -170,6 +170,7 @@ def test_a_chessboard_that_is_not_whole_is_not_found(one, damage):
     assert np.isnan(find_corners(picture, CHESSBOARD)).all()
 
 
+@pytest.mark.slow
 def test_another_board_is_not_taken_for_the_board(one):
     assert np.isnan(find_corners(one[2], Board.chessboard(8, 7, 0.025))).all()
 

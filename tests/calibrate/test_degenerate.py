@@ -36,6 +36,7 @@ def test_boards_that_are_parallel_to_the_sensor(fov, one_distance, noise):
         calibrate(parallel(fov, one_distance, noise), BOARD, SIZE, "KannalaBrandt")
 
 
+@pytest.mark.slow
 def test_no_model_is_found_from_boards_that_are_parallel_to_the_sensor():
     with pytest.raises(CalibrationError, match="nearly parallel to the sensor: tilt them by 20 to"):
         calibrate(parallel(100, False, 0.2), BOARD, SIZE, "auto")
@@ -113,6 +114,7 @@ def test_corners_in_the_middle_only_are_doubted():
 MESSES = st.sampled_from(["noise", "nan", "same", "swap", "far", "none", "row"])
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     seed=st.integers(0, 10**6),

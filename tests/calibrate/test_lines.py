@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import slow_but
 
 from darswin import lens as lenses
 from darswin.calibrate import CalibrationError, estimate, lines
@@ -96,9 +97,12 @@ def rim_of(lens, radius=240.0):
 
 @pytest.mark.parametrize(
     ("name", "model"),
-    [(name, "Spherical") for name in LENSES]
-    + [(name, "KannalaBrandt") for name in LENSES if name.startswith("kannala")],
-)
+    slow_but(
+        [(name, "Spherical") for name in LENSES]
+        + [(name, "KannalaBrandt") for name in LENSES if name.startswith("kannala")],
+        ("equisolid", "Spherical"), ("kannala 200", "KannalaBrandt"),
+    ),
+)  # fmt: skip
 def test_a_lens_is_found_from_lines_in_three_directions(name, model):
     curves = [curves_of(LENSES[name], seed) for seed in (1, 2)]
     found = from_curves(curves, SIZE, model)
@@ -108,7 +112,7 @@ def test_a_lens_is_found_from_lines_in_three_directions(name, model):
     assert 40 <= found.curves <= 80 and 0.8 < found.covered <= 1
 
 
-@pytest.mark.parametrize("model", ["Division", "OCam"])
+@pytest.mark.parametrize("model", slow_but(["Division", "OCam"], "OCam"))
 def test_the_division_model_is_an_ocam_lens(model):
     curves = [curves_of(LENSES["division"], seed) for seed in (1, 2)]
     found = from_curves(curves, SIZE, model)
@@ -119,6 +123,7 @@ def test_the_division_model_is_an_ocam_lens(model):
     assert f"{math.degrees(found.rim):.1f}° at the rim" in said["verdict"]
 
 
+@pytest.mark.slow
 def test_straightness_alone_does_not_tell_the_focal_length():
     """Lines of one direction: a lens is refused, unless the field of view is known."""
     lens = LENSES["stereographic"]
@@ -141,6 +146,7 @@ def test_a_factor_of_the_tangent_keeps_lines_straight():
     assert np.linalg.matrix_rank(rays * (1, 1, 1.7)) == 2
 
 
+@pytest.mark.slow
 def test_the_centre_is_found_if_there_are_many_curves():
     lens = LENSES["equidistant"]
     curves = [curves_of(lens, s, 80, bent=0, askew=0, center=(6.0, -4.0)) for s in range(4)]
@@ -150,6 +156,7 @@ def test_the_centre_is_found_if_there_are_many_curves():
     torch.testing.assert_close(fixed.lens.center[0], f64(325.5, 235.5), atol=0.1, rtol=0)
 
 
+@pytest.mark.slow
 def test_edges_of_a_black_frame_are_no_lines():
     lens, along, down = LENSES["spherical 0.3"], np.arange(630.0), np.arange(470.0)
     curves = [curves_of(lens, seed, 15, bent=0) for seed in range(2)]
@@ -158,6 +165,7 @@ def test_edges_of_a_black_frame_are_no_lines():
     assert from_curves(framed, SIZE).to_dict() == from_curves(curves, SIZE).to_dict()
 
 
+@pytest.mark.slow
 def test_larger_pictures_of_the_same_sharpness_give_the_same_lens():
     curves = curves_of(LENSES["equidistant"], 1, 25)
     large = [np.repeat(4 * curve + 1.5, 4, 0) for curve in curves]
@@ -166,6 +174,7 @@ def test_larger_pictures_of_the_same_sharpness_give_the_same_lens():
     assert same.lens.focal.item() == pytest.approx(4 * found.lens.focal.item(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_short_edges_of_a_board_in_many_poses_determine_a_narrow_lens():
     """All lines of a picture are in one plane, and some edges behind it are in any direction."""
     lens = lenses.BrownConrady(f64(540.0), radial=f64(-0.27, 0.04)[None], **F64)
@@ -188,7 +197,8 @@ def test_an_interval_holds_the_truth_in_two_cases_of_three():
 @pytest.mark.parametrize(
     ("of_second", "askew", "doubt"),
     [(15, 6, None), (4, 0, "only 4 lines of a picture have a second direction"),
-     (12, 80, "of the lines agree with orthogonal directions")],
+     pytest.param(12, 80, "of the lines agree with orthogonal directions",
+                  marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_few_orthogonal_lines_are_a_doubt(of_second, askew, doubt):
     lens = LENSES["equidistant"]
@@ -217,6 +227,7 @@ def test_too_little_evidence_is_refused_in_one_sentence():
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_no_lens_at_all_is_no_answer(monkeypatch):
     curves = [curves_of(LENSES["equisolid"], 1)]
     monkeypatch.setattr(lines, "NARROWEST", from_curves(curves, SIZE).rim + 0.1)
@@ -230,6 +241,7 @@ def test_an_interval_has_only_angles_of_lenses(monkeypatch):
     assert found.interval == (0.0, math.pi) and "very different lenses" in found.doubts[0]
 
 
+@pytest.mark.slow
 def test_an_estimate_is_the_same_bits_again():
     curves = [curves_of(LENSES["equisolid"], 1)]
     one, two = (from_curves(curves, SIZE).to_dict() for _ in range(2))

@@ -43,6 +43,7 @@ def test_the_preset_few_learns_96_pictures_that_two_cores_does_not(tmp_path):
     assert right["few"] > 0.7 and right["two_cores"] < 0.5
 
 
+@pytest.mark.slow
 def test_the_size_of_a_training_its_end_and_what_is_next(tmp_path, capsys):
     run = tmp_path / "a run"
     fit(run, *DIGITS)

@@ -1,5 +1,6 @@
 """Answers to a stream of images: classes, and files of a network whose answer is known."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import slow_but
 from PIL import Image
 from videos import write_video
 
@@ -337,12 +339,17 @@ KINDS = [name for name in models_for("segmentation") if name.endswith("nano")]
 GENERAL = dict(tangential=[0.02, -0.01], affine=[[1.0, 0.05], [0.0, 0.9]])
 
 
-@pytest.mark.parametrize("name", KINDS)
+ANSWERS = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
+
+
 @pytest.mark.parametrize(
-    ("task", "answers_of"), [("segmentation", LabelAnswers), ("distance", DistanceAnswers)]
-)
-def test_every_pixel_that_a_ray_reaches_has_an_answer(name, task, answers_of, tmp_path, recwarn):
+    ("name", "task"),
+    slow_but([*itertools.product(KINDS, ANSWERS)], ("swin_unet_nano", "distance"),
+             ("darswin_unet_a_nano", "segmentation")),
+)  # fmt: skip
+def test_every_pixel_that_a_ray_reaches_has_an_answer(name, task, tmp_path, recwarn):
     """Of square, wide and tall pictures, of lenses whose circle is cut, shifted or sheared."""
+    answers_of = ANSWERS[task]
     options = dict(task=task, num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
     if has_image_size(name):
         options["image_size"] = 64

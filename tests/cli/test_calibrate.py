@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from calibrate_boards import Renderer
+from helpers import slow_but
 from PIL import ExifTags, Image
 
 from darswin import lens
@@ -87,6 +88,7 @@ def test_pictures_become_a_lens_a_figure_and_a_report(folder, capsys):
     main(["lens", "show", "made.json", "boards/0.png", "--rings=4", "--sectors=8"])
 
 
+@pytest.mark.slow
 def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypatch):
     monkeypatch.setattr(
         "darswin.calibrate.search.CANDIDATES", ("Perspective", "Equidistant", "KannalaBrandt")
@@ -99,7 +101,7 @@ def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypat
     assert_is_true(lens.load("made.yaml", dtype=torch.float64))
 
 
-@pytest.mark.parametrize("orientation", [2, 3, 5, 6, 8])
+@pytest.mark.parametrize("orientation", slow_but([2, 3, 5, 6, 8], 6, 8))
 def test_pixels_are_those_that_the_camera_stores(folder, capsys, orientation):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
@@ -204,6 +206,7 @@ def test_a_blurred_board_is_named(folder, capsys):
     assert "blurred" in line or "no board found" in line
 
 
+@pytest.mark.slow
 def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     some = [f"boards/{k}.png" for k in (0, 1)]
     line = refusal(capsys, *some, "--board=7x4", "--square=1")
@@ -226,6 +229,7 @@ def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     assert "boards/0.png has 360×320 (W×H) px, large.png has 320×360" in line
 
 
+@pytest.mark.slow
 def test_mirrored_pictures_are_told(folder, capsys):
     for file in (folder / "markers").iterdir():
         cv2.imwrite(str(file), cv2.imread(str(file))[:, ::-1])

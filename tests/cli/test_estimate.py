@@ -53,6 +53,7 @@ def test_a_lens_is_estimated_and_written(rooms, tmp_path, capsys):
     assert content["lens"]["model"] == "Spherical" and content["interval"][0] <= content["rim"]
 
 
+@pytest.mark.slow
 def test_pictures_turned_by_exif_give_the_lens_of_stored_pictures(rooms, tmp_path):
     from PIL import Image
 

@@ -165,6 +165,7 @@ def test_a_run_is_not_overwritten(capsys, tmp_path, monkeypatch):
     assert message in error(capsys, "fit", "--run", tmp_path)
 
 
+@pytest.mark.slow
 def test_a_run_s_options_and_checkpoints_of_other_models(capsys, tmp_path):
     linear._measured.clear()
     backend = ["--model.matmul_backend", "autotune", "--model.grad_checkpointing", "true"]
@@ -209,6 +210,7 @@ def test_all_broken_files_are_named_before_the_training(capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_each_split_is_checked_once(tmp_path, monkeypatch):
     checked = []
     monkeypatch.setattr(

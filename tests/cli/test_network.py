@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import product
 from PIL import Image
 
 pytest.importorskip("onnx")
@@ -120,8 +121,7 @@ def picture_of(name, place, channel):
     return paint(project(rim_of(direction_of(*place)), **options), channel)
 
 
-@pytest.mark.parametrize("name", LENSES)
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(("view", "name"), product(VIEWS, LENSES))
 def test_a_disc_is_found_at_its_place(tmp_path, view, name):
     size, tolerance = VIEWS[view]
     places = [p for p in LENSES[name][2] if view != "perspective" or max(map(abs, p)) < 50]

@@ -27,6 +27,7 @@ def digits(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_a_run_s_model(digits, tmp_path, capsys):
     main(["quantize", "--run", str(digits), "--pictures", "40"])
     said = capsys.readouterr().out

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from helpers import product
 from PIL import ExifTags, Image
 from pngs import PALETTE, png
 from scenes import write, write_plain
@@ -94,8 +95,7 @@ def told(samples):
     return None
 
 
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(("change", "suffix"), product(CHANGES, SUFFIXES))
 def test_what_the_check_refuses_is_what_reading_refuses(tmp_path, suffix, change):
     """Only headers are read, so that a file may be broken later in a format without an end."""
     source = write_photos(tmp_path, suffix)

@@ -281,6 +281,7 @@ def test_pixels_are_read_at_their_points(name):
         assert ((away < -1) | (away > [width, height])).any(-1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_content_moves_to_where_its_point_moves(name):
     lens = LENSES[name]

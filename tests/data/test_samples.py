@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from frames import CALIBRATIONS, WOODSCAPE, write_frames
+from helpers import slow_but
 from PIL import ExifTags, Image
 from scenes import write_plain
 from torch.utils.data import DataLoader
@@ -104,7 +105,7 @@ def test_a_sample_depends_on_its_draw_alone(folders, name):
         assert str(dataset[Draw(4, 2, 5)][1]) != str(first[1]) != str(dataset[Draw(3, 2, 4)][1])
 
 
-@pytest.mark.parametrize("name", DATASETS)
+@pytest.mark.parametrize("name", slow_but(DATASETS, "wide", "labels"))
 def test_samples_are_the_same_for_any_number_of_workers(folders, name, threads):
     batches = []
     for workers, count in ((0, 1), (0, 2), (1, 1), (2, 1)):

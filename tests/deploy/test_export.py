@@ -199,6 +199,7 @@ def translated(monkeypatch):
     return sizes
 
 
+@pytest.mark.slow
 def test_each_block_is_traced_once(translated, monkeypatch):
     pytest.importorskip("onnxscript")
     model, images, blocks = create_model("darswin_a_nano").eval(), torch.zeros(1, 3, 64, 64), []
@@ -216,6 +217,7 @@ def test_each_block_is_traced_once(translated, monkeypatch):
         blocks.clear()
 
 
+@pytest.mark.slow
 def test_a_fixed_lens_is_solved_before_the_graph_begins(translated):
     pytest.importorskip("onnxscript")
     model, images = short("conv_unet_nano", task="distance"), torch.zeros(1, 3, 32, 32)
@@ -283,35 +285,6 @@ def sampled(model, images, lens):
     prepared = model.prepare(lens, model._checked(images).shape[2:])
     inputs = dict(tokens=model.sample(images, prepared))
     return inputs | (dict(images=images) if model.refines_with_images else {})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "options", "lens"),
-    [
-        ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL),
-        ("darswin_unet_a_nano", dict(ONE_BLOCK, task="distance"), SPHERICAL[0]),
-        ("darswin_unet_ra_nano", dict(ONE_BLOCK, skip_width=0), POLYNOMIAL),
-        ("swin_undis_nano", ONE_BLOCK, SPHERICAL[0]),
-    ],
-)
-def test_graphs_that_start_at_the_tokens(name, options, lens, tmp_path):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    model, fixed, path = short(name, **options), len(lens) == 1, tmp_path / "model.onnx"
-    settings = dict(fixed_lens=fixed, input="tokens")
-    export_onnx(model, path, *batch_of(lens, 1)[:2], **settings)
-    program = export_program(model, *batch_of(lens, 1)[:2], **settings).module()
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    with torch.no_grad():
-        for count in (1, 5):
-            images, lenses, tensors = batch_of(lens, count)
-            inputs, expected = sampled(model, images, lenses), model(images, lenses)
-            named = {} if fixed else tensors
-            assert [i.name for i in session.get_inputs()] == [*inputs, *named]
-            feed = {key: tensor.numpy() for key, tensor in (inputs | named).items()}
-            (logits,) = session.run(["logits"], feed)
-            for got in (torch.from_numpy(logits), program(*inputs.values(), **named)):
-                assert (got - expected).abs().max() <= 1e-4 * expected.abs().max()
 
 
 @pytest.mark.slow

@@ -1,13 +1,14 @@
 """What `optimize` makes of a model besides its results, which tests/models compares."""
 
 import copy
+import itertools
 import math
 import pickle
 import warnings
 
 import pytest
 import torch
-from helpers import network, relative_error
+from helpers import network, product, relative_error
 
 from darswin import optimize
 from darswin.layers.position_bias import RelativeBias
@@ -45,8 +46,11 @@ def test_large_batches_go_in_parts(monkeypatch, lenses):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano", "darswin_unet_a_nano"])
-@pytest.mark.parametrize("lenses", [1, 200])
+@pytest.mark.parametrize(
+    ("name", "lenses"),
+    [*itertools.product(["darswin_a_nano", "swin_undis_nano"], [1, 200]),
+     *(pytest.param("darswin_unet_a_nano", n, marks=pytest.mark.slow) for n in (1, 200))],
+)  # fmt: skip
 def test_large_batches_have_the_bits_of_small_ones(name, lenses):
     fast = optimize(network(name))  # a part of a batch has at most 170 images
     side = fast.image_size or (32, 32)
@@ -127,9 +131,11 @@ def test_what_cannot_be_optimized():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("weights", [torch.float64, torch.bfloat16])
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano", "dat_nano", "swin_unet_nano",
-                                  "darswin_unet_a_nano", "conv_unet_nano"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    product(["darswin_a_nano", "swin_nano", "dat_nano", "conv_unet_nano", "swin_unet_nano",
+             "darswin_unet_a_nano"], [torch.float64, torch.bfloat16]),
+)  # fmt: skip
 def test_weights_of_any_dtype(name, weights):
     model = network(name, mean=0.5, std=0.25).to(weights)
     side = model.image_size or (32, 32)

@@ -115,6 +115,7 @@ def test_layers_of_8_bits():
     torch.testing.assert_close(layer.to_linear()(rounded), layer(x))
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_what_disturbs_most_stays_in_float32():
     model, seen = network(), batch()
@@ -170,6 +171,7 @@ def test_layers_that_cannot_go_together_are_named():
             optimize(model, torch.int8)
 
 
+@pytest.mark.slow
 def test_what_is_to_stay_stays():
     model, seen = network(), batch()
     keep = ["stages.0", "stages.1.blocks.0.attn", "stages.2.blocks.0.mlp.fc1"]
@@ -190,6 +192,7 @@ def test_what_is_to_stay_stays():
             assert relative_error(fast, quantized(*seen)) < 0.02
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_saved_and_loaded(tmp_path):
     model, seen = network(), batch()
@@ -206,6 +209,7 @@ def test_saved_and_loaded(tmp_path):
         load_model(tmp_path / "w.safetensors")
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_fastest(monkeypatch):
     model, seen = network(), batch()
@@ -220,6 +224,7 @@ def test_fastest(monkeypatch):
     assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_8_bits_without_vnni(monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: True)

@@ -18,16 +18,33 @@ from darswin.models.registry import has_image_size, model_class
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 NORMALIZED = dict(mean=MEAN, std=STD)
 ENCODERS = [name for name in list_models() if issubclass(model_class(name), Encoder)]
+OPTIONS = {
+    "backbone": dict(features_only=True),
+    "grey": dict(in_chans=1, mean=0.4, std=0.2),
+    "grey backbone": dict(features_only=True, in_chans=1, mean=0.4, std=0.2),
+    "distance": dict(task="distance"),
+    "mercator": dict(view="mercator", size=(40, 30)),
+    "equirectangular": dict(view="equirectangular", fov=2.8),
+}
 CASES = [
     *list_models(),
     *(f"{name} backbone" for name in ENCODERS),
     *(f"adapter {view}" for view in ("square", "perspective", "polar")),
 ]
+# Other pixels and views of the smallest models.
+MORE = [
+    *(f"{name} grey" for name in list_models() if name.endswith("nano")),
+    *(f"{name} grey backbone" for name in ENCODERS if name.endswith("nano")),
+    "darswin_unet_a_nano distance",
+    "swin_unet_undis_nano distance",
+    "conv_unet_nano mercator",
+    "swin_unet_nano equirectangular",
+]
 
 
 def cost(case):
     """Marks the larger sizes of a model as slow: they differ from the smaller in numbers alone."""
-    large = case.endswith(("small", "tiny", "small backbone", "tiny backbone"))
+    large = "nano" not in case and "adapter" not in case
     return pytest.param(case, marks=[pytest.mark.slow] if large else [])
 
 
@@ -35,17 +52,21 @@ def made(case):
     """A model in eval mode, a frame of uint8, and its lens."""
     torch.manual_seed(0)
     kind, _, rest = case.partition(" ")
-    side = side_of(case)
+    height, width, channels = side_of(case), side_of(case) + 10, 3
     if kind == "adapter":
         network = nn.Sequential(nn.Conv2d(3, 4, 3, padding=1), nn.GELU(), nn.Conv2d(4, 5, 2, 2))
         model: nn.Module = LensAdapter(network, 24, view=rest, **NORMALIZED)
     else:
-        options = dict(features_only=True) if rest else dict(num_classes=5)
+        options = NORMALIZED | OPTIONS.get(rest, {})
+        if "features_only" not in options:
+            options |= dict(num_classes=5)
         if has_image_size(kind):
-            options |= dict(image_size=side)
-        model = create_model(kind, **options, **NORMALIZED)
-    frame = torch.randint(256, (1, side, side, 3), dtype=torch.uint8)
-    return model.eval(), frame, Spherical.from_fov(0.5, 2.6, side / 2)
+            width = height
+            options |= dict(image_size=height)
+        model = create_model(kind, **options)
+        channels = options.get("in_chans", 3)
+    frame = torch.randint(256, (1, height, width, channels), dtype=torch.uint8)
+    return model.eval(), frame, Spherical.from_fov(0.5, 2.6, height / 2)
 
 
 def assert_same(found, expected, tolerance):
@@ -56,7 +77,7 @@ def assert_same(found, expected, tolerance):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("case", list(map(cost, CASES)))
+@pytest.mark.parametrize("case", list(map(cost, CASES + MORE)))
 def test_it_does_not_matter_who_samples_the_frame(case):
     model, frame, lens = made(case)
     size = tuple(frame.shape[1:3])
@@ -64,7 +85,7 @@ def test_it_does_not_matter_who_samples_the_frame(case):
     sampled, result = model.sample(frame, prepared), model(frame, lens)
     assert_same(model.run_sampled(sampled, prepared, frame), result, 1e-5)
     if prepared.points is None:
-        with pytest.raises(ValueError, match="takes images as they are"):
+        with pytest.raises(ValueError, match="takes images as they are: it needs no plan"):
             frames.plan(model, lens, size)
     else:
         read = frames.Sampler(frames.plan(model, lens, size))(frame[0].numpy())

@@ -31,6 +31,7 @@ def page(name: str) -> str:
     return (ROOT / name).read_text()
 
 
+@pytest.mark.slow
 def test_the_readme_is_short_and_lines_fit():
     assert README.count("\n") <= 160 and max(map(len, README.splitlines())) < 120
     for path in fill.PAGES:
@@ -38,6 +39,7 @@ def test_the_readme_is_short_and_lines_fit():
             assert len(line) < 120 or line.startswith("|"), (path, line)
 
 
+@pytest.mark.slow
 def test_sentences_are_short():
     for path in fill.PAGES:
         text = re.sub(r"^(`{3,}|:{3,})[^\n]*\n.*?^\1$", "\n\n", path.read_text(), flags=re.M | re.S)
@@ -48,6 +50,7 @@ def test_sentences_are_short():
                 assert len(sentence.split()) <= 40, (path, sentence)
 
 
+@pytest.mark.slow
 def test_pictures_and_links_exist():
     for path in fill.PAGES:
         for target in re.findall(r"(?:\]\(|\]: |`[^`<]* <)([^)#>\s]+)[)#>]", path.read_text()):
@@ -65,6 +68,7 @@ def test_tables_are_those_of_the_results():
         assert "not run" not in table
 
 
+@pytest.mark.slow
 def test_the_drop_in_call_is_faster_than_what_it_replaces():
     for record in fill.records("sampling").values():
         calls = [
@@ -75,6 +79,7 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
         assert len(calls) == 6 and min(t.ratio for t in calls) > 1
 
 
+@pytest.mark.slow
 def test_one_frame_is_faster_than_in_other_runtimes():
     (record,) = fill.records("one_frame").values()
     loops = [t for t in record.timings if not t.paced]
@@ -94,6 +99,7 @@ def parameters(name: str, **options) -> int:
         return sum(p.numel() for p in create_model(name, **options).parameters())
 
 
+@pytest.mark.slow
 def test_parameter_counts_are_those_of_the_models():
     counted = re.search(
         r"with (\d+) classes:\n\n\| \| (.*) \|\n.*\n((?:\| `.*\n)+)", page("docs/howto/use.md")
@@ -121,6 +127,7 @@ def mean_accuracy(runs: dict, label: str, level: str, xi: str) -> float:
     return statistics.mean(run[xi] for run in runs[label, level])
 
 
+@pytest.mark.slow
 def test_the_front_page_tells_what_the_studies_measured():
     """Its sentences on Fashion-MNIST, on dense tasks, and on when not to use darswin."""
     runs, text = study_runs(), " ".join(README.split())
@@ -172,6 +179,7 @@ def test_the_front_page_tells_what_the_studies_measured():
     assert f"`polar_sample` is just {least:.1f} to {most:.1f} times as fast" in text
 
 
+@pytest.mark.slow
 def test_the_study_shows_its_point():
     runs = study_runs()
 
@@ -190,6 +198,7 @@ def test_the_study_shows_its_point():
     assert max(ahead) <= 2
 
 
+@pytest.mark.slow
 def test_lens_knowledge_helps_those_who_augment():
     cells = json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]
     runs = {
@@ -205,6 +214,7 @@ def test_lens_knowledge_helps_those_who_augment():
     assert ahead["Swin"][0] > 25 and max(x for of in ahead.values() for x in of[4:]) < 2.25
 
 
+@pytest.mark.slow
 def test_8_bits_lose_little():
     record = json.loads((ROOT / "studies/results/int8.json").read_text())
     runs: dict[str, list] = {}
@@ -216,6 +226,7 @@ def test_8_bits_lose_little():
     assert max(over_all) <= 0.3 and max(single) <= 1
 
 
+@pytest.mark.slow
 def test_the_dense_study_shows_its_point():
     record = json.loads((ROOT / "studies/results/dense.json").read_text())
 
@@ -241,6 +252,7 @@ def test_the_dense_study_shows_its_point():
         assert max(low, key=low.__getitem__) == "U-Net with rays"
 
 
+@pytest.mark.slow
 def test_the_sizes_study_shows_its_point():
     record = json.loads((ROOT / "studies/results/sizes.json").read_text())
     runs = sizes_tables.runs_of(record["cells"])
@@ -262,6 +274,7 @@ def test_the_sizes_study_shows_its_point():
     assert score(fixed, "100°") - score(polar, "100°") > 30
 
 
+@pytest.mark.slow
 def test_the_study_of_pretrained_detectors_shows_its_point():
     record = json.loads((ROOT / "studies/results/pretrained.json").read_text())
     tables = {name: of["methods"] for name, of in record["tables"].items()}
@@ -324,6 +337,7 @@ def test_the_study_of_pretrained_detectors_shows_its_point():
     assert second["mercator"]["map"] < second["tiles: 5"]["map"]
 
 
+@pytest.mark.slow
 def test_the_demo_shows_its_point():
     accuracy = json.loads((ROOT / "docs/accuracy.json").read_text())["accuracy"]
     assert min(min(run) for run in accuracy["DarSwin-A"]) >= 92
@@ -332,6 +346,7 @@ def test_the_demo_shows_its_point():
             assert ours[-1] - theirs[-1] >= 15
 
 
+@pytest.mark.slow
 def test_the_table_of_resampling_is_computed():
     text = (ROOT / "docs/explanation/dense.md").read_text()
     rows = re.findall(r"^\| (\d+) × (\d+) \| (.*) \|$", text, re.M)
@@ -351,6 +366,7 @@ def rows_of(text: str) -> list[list[str]]:
     return [row for row in rows if row[0][0].isdigit()]
 
 
+@pytest.mark.slow
 def test_the_pixels_that_a_grid_reads_are_computed():
     large = (ROOT / "docs/explanation/large.md").read_text()
     rows, sizes = rows_of(large), pixels_read.SIZES

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from figures import on_a_phone
+from helpers import slow_but
 from matplotlib.figure import Figure
 from PIL import Image
 from rigs import rig, true_lens
@@ -116,7 +117,7 @@ WRITTEN: dict[str, Callable[[Path], None]] = {
 }
 
 
-@pytest.mark.parametrize("name", [*RETURNED, *WRITTEN])
+@pytest.mark.parametrize("name", slow_but([*RETURNED, *WRITTEN], "labels", "metres", "polar"))
 def test_the_text_of_a_figure_is_large_enough(name, monkeypatch, tmp_path):
     figures = []
     for module in (

@@ -23,7 +23,6 @@ from darswin.lens.files.content import parse
 from darswin.lens.files.load import FORMATS, Calibration
 
 UNKNOWN = r"^calibration in a string: unknown format: it.*\. The formats are darswin, WoodScape"
-MATRIX_OF_4 = "1 0 0 0.5\n0 1 0 0\n0 0 1 2\n0 0 0 1\n"
 # Files of other programs, which have an entry or the notation of a known format.
 OTHERS = {
     "rig": "intrinsic:\n  left: {model_type: POLYFISHEYE, camera_name: left, image_width: 350}\n",
@@ -36,55 +35,80 @@ OTHERS = {
     "options": yaml.safe_dump(dict(k=5, m=3, size=9, width=64, model="darswin", lr=0.1)),
     "list": json.dumps(dict(K=[1, 2, 3, 4])),
     "anchors": yaml.safe_dump(dict(camera=dict(camera_model="x"), sensor=dict(rate=20))),
-    "Metashape": (
-        '<document version="2.0.0"><chunk><sensor><calibration class="initial"><f>14</f>'
-        '</calibration><calibration class="adjusted"><f>15</f></calibration></sensor></chunk>'
-        "</document>"),
     "URDF": "<robot><link><k>1</k></link><link><k>2</k></link></robot>",
     "camera matrix": "8.12e+02 0 6.402e+02\n0 8.114e+02 3.617e+02\n0 0 1\n",
     "small matrix": "2 0 1\n0 2 1\n0 0 1\n",
     "coefficients": "-0.22 0.05 0.001 -0.002 0.003\n",
     "one number": "5\n",
-    "pose": MATRIX_OF_4,
+    "pose": "1 0 0 0.5\n0 1 0 0\n0 0 1 2\n0 0 0 1\n",
     "trajectory": "1305031102.17 1.34 0.63 1.66 0.66 0.62 -0.29 -0.33\n" * 9,
     "images.txt": "1 0.8 0.1 0.2 0.5 1.0 2.0 3.0 1 a.png\n2362.3 248.4 58396\n",
     "classes": "0 cat\n1 dog\n2 bird\n",
     "capitals": "0 CAT\n1 DOG\n",
 }  # fmt: skip
+MATRIX = "camera_matrix and distortion_coefficients"
+# Texts with unknown names of entries, these names, and those that are expected.
+NAMES = (
+    (json.dumps(dict(camera_mat=K, dist_coefs=[0.1] * 5)), "camera_mat, dist_coefs", MATRIX),
+    (json.dumps(dict(foo=1, bar=2)), "foo, bar", MATRIX),
+    (json.dumps(dict(f_x=1, f_y=2, c_x=1, k_1=3)), "f_x, f_y, c_x, k_1", "fx, fy, cx, cy"),
+    (json.dumps(dict(flx=1, fly=2, cx=1, cy=3)), "flx, fly, cx, cy", "fl_x, fl_y, cx, cy"),
+    ("cam_0: {model: ds}\ncamera_modell: ds", "cam_0, camera_modell", "cam0 with camera_model"),
+    ("projection_params: {a: 1}\nmodel_types: MEI\n", "projection_params, model_types",
+     "model_type and projection_parameters"),
+    ("{}", "none", MATRIX),
+)  # fmt: skip
+# Texts of programs, which are known, and the format that they should write.
+PROGRAMS = (
+    ("<calibration><projection>fisheye</projection><width>9</width><f>3</f><cx>1</cx><k1>0</k1>"
+     "<k2>0</k2></calibration>", "Metashape", "OpenCV"),
+    ('<document version="2.0.0"><chunk><sensor><calibration class="initial"><f>14</f>'
+     '</calibration><calibration class="adjusted"><f>15</f></calibration></sensor></chunk>'
+     "</document>", "Metashape", "OpenCV"),
+    (json.dumps(dict(sfm_data_version="0.3", root_path="/x", views=[], intrinsics=[],
+                     extrinsics=[], structure=[])), "OpenMVG", "COLMAP"),
+    (json.dumps(dict(version=["1"], views=[], intrinsics=[], poses=[])), "Meshroom", "COLMAP"),
+)  # fmt: skip
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_one_entry_is_no_format(name):
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        *((text, "") for text in OTHERS.values()),
+        *((text, f"its entries are {found}, but expected are, for example, {expected}")
+          for text, found, expected in NAMES),
+        *((text, f", as in files of {program}: let it write the cameras for {other}. The")
+          for text, program, other in PROGRAMS),
+    ],
+)  # fmt: skip
+def test_a_text_of_no_format_is_told_by_its_entries(text, said):
     with pytest.raises(ValueError, match=UNKNOWN) as error:
-        loads(OTHERS[name])
-    said = str(error.value)
-    assert ": its entries are " in said or ": it is a table of " in said
-    assert "unknown lens model" not in said or name == "options"
-    assert len(said) < 900 and "appears twice" not in said
+        loads(text)
+    found = str(error.value)
+    assert said in found and (": its entries are " in found or ": it is a table of " in found)
+    assert ("unknown lens model" in found) == (text == OTHERS["options"])
+    assert ("as in files of" in found) == (said.startswith(", as")) and len(found) < 900
+    assert not (said.startswith(", as") and "expected are" in found)
+    assert "appears twice" not in found
 
 
-# A file of each format. What it lacks is said in the words of its format.
-ONE_LACKING = {
-    "darswin": ("ours.json", '"focal": 300.0,', "focal is missing"),
-    "WoodScape": ("woodscape.json", '"model": "radial_poly",', "intrinsic.model is missing"),
-    "basalt": ("basalt.json", '"camera_type": "eucm",', "camera_type is missing"),
-    "nerfstudio": ("nerfstudio.json", '"fl_x": 851.2, ', "fl_x is missing"),
-    "KITTI-360 or CamOdoCal": ("kitti360_02.yaml", "model_type: MEI", "model_type is missing"),
-    "Kalibr": ("kalibr_ds.yaml", "  distortion_model: none\n", "distortion_model is missing"),
-    "ROS camera_info": ("ros_fisheye.yaml", "image_width: 1280", "image_width is missing"),
-    "OpenCV": ("opencv_fisheye.yaml", "image_width: 1280", "image_width is missing"),
-    "OCamCalib": ("ocamcalib.txt", "0.998700 0.000420", "the affine parameters"),
-    "COLMAP": ("colmap.txt", " -0.00021", "OPENCV_FISHEYE must have 8 parameters"),
-}
-
-
-@pytest.mark.parametrize("name", ONE_LACKING)
-def test_a_file_that_lacks_one_entry_is_still_of_its_format(name):
-    file, removed, said = ONE_LACKING[name]
-    text = file_text(file)
-    assert removed in text
-    with pytest.raises(ValueError, match=f"{name} calibration in a string: .*{said}"):
-        loads(text.replace(removed, "", 1), camera=0 if name == "basalt" else None)
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [("KanalaBrandt", "KannalaBrandt"), ("equidistant", "Equidistant"), ("Sperical", "Spherical"),
+     ("brown_conrady", "BrownConrady"), ("EQUISOLID", "Equisolid"), ("zzz", None), ("Kb", None)],
+)  # fmt: skip
+def test_an_unknown_model_gets_the_nearest_name(given, nearest):
+    meant = f"; did you mean {nearest}? The models" if nearest else ". The models"
+    said = re.escape(f"unknown lens model '{given}'{meant}")
+    for start, make in (
+        (UNKNOWN.partition("it.*")[0] + ".*; in a darswin file, ",
+         lambda: loads(json.dumps(dict(model=given, focal=300)))),
+        ("", lambda: from_dict(dict(model=given, focal=300))),
+        ("", lambda: fit(given, load(FILES / "ours.json"))),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=start + said) as error:
+            make()
+    assert all(name in str(error.value) for name in MODELS)
 
 
 @pytest.mark.parametrize("path", sorted(FILES.iterdir()), ids=lambda path: path.name)
@@ -109,70 +133,6 @@ def test_entries_that_others_have_too_do_not_change_the_format():
         flat("k1", "k2", "k3", "k4", frames=12, model_type="fisheye"),
     ):
         assert loads(text).image_size.tolist() == [[960, 1280]]
-
-
-# -- what an unknown file has, and what is expected ---------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "found", "expected"),
-    [
-        (json.dumps(dict(camera_mat=K, dist_coefs=[0.1] * 5)), "camera_mat, dist_coefs",
-         "camera_matrix and distortion_coefficients"),
-        (json.dumps(dict(foo=1, bar=2)), "foo, bar", "camera_matrix and distortion_coefficients"),
-        (json.dumps(dict(f_x=1, f_y=2, c_x=1, k_1=3)), "f_x, f_y, c_x, k_1", "fx, fy, cx, cy"),
-        (json.dumps(dict(flx=1, fly=2, cx=1, cy=3)), "flx, fly, cx, cy", "fl_x, fl_y, cx, cy"),
-        ("cam_0: {model: ds}\ncamera_modell: ds", "cam_0, camera_modell", "cam0 with camera_model"),
-        ("projection_params: {a: 1}\nmodel_types: MEI\n", "projection_params, model_types",
-         "model_type and projection_parameters"),
-        ("{}", "none", "camera_matrix and distortion_coefficients"),
-    ],
-)  # fmt: skip
-def test_names_of_entries_that_are_unknown(text, found, expected):
-    with pytest.raises(ValueError) as error:
-        loads(text)
-    said = str(error.value)
-    assert f"its entries are {found}, but expected are, for example, {expected}" in said, said
-    assert "unknown lens model" not in said
-
-
-@pytest.mark.parametrize(
-    ("text", "program", "other"),
-    [
-        ("<calibration><projection>fisheye</projection><width>9</width><f>3</f><cx>1</cx><k1>0</k1>"
-         "<k2>0</k2></calibration>", "Metashape", "OpenCV"),
-        (OTHERS["Metashape"], "Metashape", "OpenCV"),
-        (json.dumps(dict(sfm_data_version="0.3", root_path="/x", views=[], intrinsics=[],
-                         extrinsics=[], structure=[])), "OpenMVG", "COLMAP"),
-        (json.dumps(dict(version=["1"], views=[], intrinsics=[], poses=[])), "Meshroom", "COLMAP"),
-    ],
-)  # fmt: skip
-def test_files_of_other_programs_are_known(text, program, other):
-    with pytest.raises(ValueError, match=UNKNOWN) as error:
-        loads(text)
-    said = str(error.value)
-    assert f", as in files of {program}: let it write the cameras for {other}. The" in said
-    assert "expected are" not in said
-
-
-@pytest.mark.parametrize(
-    ("given", "nearest"),
-    [("KanalaBrandt", "KannalaBrandt"), ("equidistant", "Equidistant"), ("Sperical", "Spherical"),
-     ("brown_conrady", "BrownConrady"), ("EQUISOLID", "Equisolid"), ("zzz", None), ("Kb", None)],
-)  # fmt: skip
-def test_an_unknown_model_gets_the_nearest_name(given, nearest):
-    with pytest.raises(ValueError, match=UNKNOWN) as error:
-        loads(json.dumps(dict(model=given, focal=300)))
-    said = str(error.value)
-    assert all(name in said for name in MODELS)
-    meant = f"; did you mean {nearest}? The models" if nearest else ". The models"
-    assert f"in a darswin file, unknown lens model '{given}'{meant}" in said
-    for make in (
-        lambda: from_dict(dict(model=given, focal=300)),
-        lambda: fit(given, load(FILES / "ours.json")),
-    ):
-        with pytest.raises(ValueError, match=re.escape(f"unknown lens model '{given}'{meant}")):
-            make()
 
 
 # -- files that are no calibrations ---------------------------------------------------------------

@@ -122,6 +122,7 @@ def genuine():
     yield "wide pinhole", Perspective(400.0, 1.2, image_size=(1080, 1920))
 
 
+@pytest.mark.slow
 def test_real_lenses_and_their_crops_are_not_doubted():
     lenses = dict(genuine())
     assert len(lenses) > 60

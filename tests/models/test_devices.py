@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers import slow_but
 from launches import Launches, launches
 
 from darswin import lens
@@ -56,7 +57,10 @@ def images(dtype=torch.float32, size=64):
     return torch.empty(2, 3, size, size, device="meta", dtype=dtype)
 
 
-@pytest.mark.parametrize(("name", "kind", "dtype"), CALLS)
+@pytest.mark.parametrize(
+    ("name", "kind", "dtype"),
+    slow_but(CALLS, *CALLS[: len(MODELS)], *(call for call in CALLS if call[0] == VIEWS[0])),
+)
 def test_no_model_waits_in_a_step(name, kind, dtype, monkeypatch):
     # All steps of Newton's method are alike, so three of them are enough.
     monkeypatch.setattr(solve, "_STEPS", 3)
@@ -128,6 +132,7 @@ def test_a_loss_that_is_not_finite_is_told_where_lightning_logs(monkeypatch):
                 task.training_step(([0],), step)
 
 
+@pytest.mark.slow
 def test_launches_of_darswin_a_small():
     model, lenses = network("darswin_a_small", num_classes=10), SPHERICAL.to("meta")
     with torch.no_grad():

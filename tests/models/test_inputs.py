@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from helpers import network, side_of
+from helpers import network, product, side_of
 from torch import nn
 
 from darswin import PolarView, list_models, optimize
@@ -106,8 +106,9 @@ def told(call):
 
 
 @torch.no_grad()
-@models
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("kind", "dtype"), product(MODELS, [torch.float32, torch.float64, torch.bfloat16])
+)
 def test_a_model_tells_once_that_floats_are_no_pixels(kind, dtype):
     model, frames, lens = made(kind, mean=MEAN, std=STD)
     model = model.to(dtype)
@@ -132,6 +133,7 @@ def test_only_the_first_calls_look_at_the_values():
     assert len(told(lambda: optimize(made("darswin_a_nano")[0])(frames.float(), lens))) == 1
 
 
+@pytest.mark.slow
 def test_graphs_and_gradients_do_not_see_the_look():
     model, frames, lens = made("darswin_a_nano")
     pixels = frames.float()

@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 import torch
-from helpers import CAMERAS, network, relative_error, side_of
+from helpers import CAMERAS, network, product, relative_error, side_of
 from torch._dynamo.testing import CompileCounter
 
 from darswin import create_model, list_models, optimize
@@ -292,8 +292,7 @@ def test_optimized_it_is_the_same(case):
     assert relative_error(half, want[0]) < 2 * usual < 0.1
 
 
-@pytest.mark.parametrize("half", [False, True])
-@nanos
+@pytest.mark.parametrize(("name", "half"), product(NANOS, [False, True]))
 def test_a_training_step_repeats_with_a_seed_with_checkpointing_and_other_products(name, half):
     model, images, lenses = made(name, drop_path_rate=0.2)
     parameters, found = [*model.train().parameters()], {}

@@ -47,6 +47,7 @@ def calls(size: int) -> list[Callable[[], list[Tensor]]]:
     ]
 
 
+@pytest.mark.slow
 def test_ten_thousand_calls_of_several_threads_have_the_same_bits(threads):
     torch.manual_seed(0)
     runs = [run for size in (1, 2, 4) for run in calls(size)]

@@ -72,6 +72,7 @@ def test_fine_tuning_beats_a_fresh_start(tmp_path):
     assert test(tuned)[0]["top1"] > test(fresh)[0]["top1"] + 0.1
 
 
+@pytest.mark.slow
 def test_the_head_stays_with_its_classes(whole, labelled, scenes, tmp_path):
     digits = ["--data.path", "digits", "--data.limit", "16", "--data.train_lenses", "low"]
     pixels = ["--task", "segmentation", "--data.path", scenes]
@@ -107,6 +108,7 @@ def test_a_classifier_gives_its_encoder(classifier, scenes, tmp_path):
     assert any(name.startswith("distance_head.") for name in again)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_does_not_read_the_weights_again(classifier, scenes, tmp_path, monkeypatch):
     weights = tmp_path / "m.safetensors"
     weights.write_bytes(classifier.read_bytes())

@@ -68,6 +68,7 @@ def options(frames, scenes, tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "kills"),
     [
@@ -87,6 +88,7 @@ def test_a_killed_run_goes_on_bit_for_bit(options, tmp_path, monkeypatch, data, 
     assert_same(tmp_path / "killed", tmp_path / "whole")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", ["digits", pytest.param("labels", marks=pytest.mark.slow)])
 def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(
     options, tmp_path, monkeypatch, data
@@ -148,6 +150,7 @@ def test_a_run_leaves_everything_in_its_folder(whole):
     assert [line["step"] for line in lines if line["train/loss"]] == [*"012345"]
 
 
+@pytest.mark.slow
 def test_signals_stop_a_run_after_a_step(whole, tmp_path, monkeypatch, capfd):
     run = tmp_path / "a run"
     handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
@@ -242,6 +245,7 @@ def test_what_may_change_on_resume(monkeypatch):
                 check_changes(before, now)
 
 
+@pytest.mark.slow
 def test_rates_and_decay_change_on_resume(begun, capsys):
     new = ["--model.learning_rate", "1e-3", "--model.weight_decay", "0.2", "--model.final_rate"]
     fit(begun, "--resume", *new, "0", "--trainer.max_epochs", "3")
@@ -258,6 +262,7 @@ def test_rates_and_decay_change_on_resume(begun, capsys):
     assert found == pytest.approx({step: learning_rate(step, **rates) for step in range(4, 9)})
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_finite_are_not_kept(begun, capsys, monkeypatch):
     def finite_without_gradients(self):
         return sum((0 * p).sqrt().sum() for p in self.net.parameters())
@@ -275,6 +280,7 @@ def test_weights_that_are_not_finite_are_not_kept(begun, capsys, monkeypatch):
     assert checkpoint(begun)["global_step"] == 6
 
 
+@pytest.mark.slow
 def test_a_cut_off_checkpoint_is_named_with_the_other_one(whole, begun, capsys):
     last, best = (begun / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     data = last.read_bytes()
@@ -323,6 +329,7 @@ def test_few_steps_are_logged_and_the_progress_bar_shows_no_folder(tmp_path, cap
 # -- what is learned, and the results of tests ------------------------------------------------
 
 
+@pytest.mark.slow
 def test_train_test_and_predict_see_the_same(frames, tmp_path, capsys):
     run = tmp_path / "run"
     fit(run, *DIGITS, "--data.path", frames, "--data.lens", WOODSCAPE)
@@ -341,6 +348,7 @@ def test_train_test_and_predict_see_the_same(frames, tmp_path, capsys):
     assert sum(right) / len(right) == pytest.approx(row["top1"])
 
 
+@pytest.mark.slow
 def test_one_test_over_all_distortions_and_of_another_camera(whole, frames, tmp_path, capsys):
     run = shutil.copytree(whole, tmp_path / "run")
     rows = test(run, "--xi", "0:1:0.5")

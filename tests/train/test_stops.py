@@ -77,6 +77,7 @@ def wholes(tmp_path_factory):
     return whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "how"), [pytest.param(case, how, marks=marks) for case, how, *marks in STOPS]
 )
@@ -106,6 +107,7 @@ def early(tmp_path, patience):
     return ["--config", str(file)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [4, pytest.param(5, marks=slow), pytest.param(12, marks=slow)])
 def test_early_stopping_ends_a_whole_step(wholes, tmp_path, every):
     """Validations after 4 and 8 of 12 batches are amid a step of 5."""
@@ -120,6 +122,7 @@ def test_early_stopping_ends_a_whole_step(wholes, tmp_path, every):
     assert_same(run, wholes("accumulated"))
 
 
+@pytest.mark.slow
 def test_a_least_number_of_epochs_holds_against_time_and_not_against_signals(tmp_path, monkeypatch):
     options = [*DIGITS, "--trainer.min_epochs", "2"]
     stop_at(monkeypatch, "time", 1, tmp_path / "time", *options)
@@ -128,7 +131,7 @@ def test_a_least_number_of_epochs_holds_against_time_and_not_against_signals(tmp
     assert checkpoint(tmp_path / "signal")["global_step"] == 1
 
 
-@pytest.mark.parametrize("how", ["time", "signal"])
+@pytest.mark.parametrize("how", ["signal", pytest.param("time", marks=slow)])
 def test_a_stop_during_a_validation(wholes, tmp_path, monkeypatch, how):
     run, whole = tmp_path / "run", wholes("accumulated")
 

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from helpers import slow_but
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -80,7 +81,7 @@ def same(a, b):
     return a == b
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_but(KINDS, "a checkpoint", "a converted checkpoint"))
 def test_no_damage_changes_weights_silently(kind, tmp_path):
     name, write, read = KINDS[kind]
     path = tmp_path / name

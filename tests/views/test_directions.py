@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers import product
 from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import every_lens
@@ -88,8 +89,7 @@ def test_rays_of_pixels_come_back_to_them(name, data):
                                rtol=1e-6, atol=1e-5)  # fmt: skip
 
 
-@pytest.mark.parametrize("name", OF_PIXELS)
-@pytest.mark.parametrize("model", every_lens())
+@pytest.mark.parametrize(("name", "model"), product(OF_PIXELS, every_lens()))
 def test_points_go_through_every_lens_and_come_back(name, model):
     lens, size = every_lens()[model]
     view = make_view(name, size if name == "none" else (200, 200))
@@ -178,6 +178,7 @@ def test_pixels_are_means_of_their_points(name):
     assert (large, small) == (1, 4)
 
 
+@pytest.mark.slow
 def test_views_of_many_lenses_are_those_of_each():
     lenses = Equidistant([100.0, 150.0, 400.0], [1.9, 1.5, 1.2])
     for name in RAY_VIEWS:

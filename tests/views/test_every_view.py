@@ -3,6 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers import product
 from torch import nn
 
 from darswin import create_model
@@ -33,7 +34,6 @@ OF_RAYS = ("cylindrical", "equirectangular", "mercator", "panorama", "stereograp
            "tiles")  # fmt: skip
 ONE_PICTURE = [name for name in list_views() if name != "tiles"]
 every_view = pytest.mark.parametrize("name", list_views())
-every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 
 
 def smooth():
@@ -48,9 +48,9 @@ def angles(lens):
 
 
 @torch.no_grad()
-@every_view
-@every_lens
-def test_what_is_seen_comes_back_also_from_coarser_maps(name, lens):
+@pytest.mark.parametrize(("name", "kind"), product(list_views(), LENSES))
+def test_what_is_seen_comes_back_also_from_coarser_maps(name, kind):
+    lens = LENSES[kind]
     view, images = make_view(name, (192, 192)), smooth().expand(lens.count, -1, -1, -1)
     prepared = view.prepare(lens, SIZE)
     seen = view.see(images, prepared)
@@ -76,9 +76,9 @@ def test_what_is_seen_comes_back_also_from_coarser_maps(name, lens):
 
 
 @torch.no_grad()
-@every_view
-@every_lens
-def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, lens):
+@pytest.mark.parametrize(("name", "kind"), product(list_views(), LENSES))
+def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, kind):
+    lens = LENSES[kind]
     size = SIZE if name == "none" else (24, 24)
     # Single points: the mean of several is not where the ray lands.
     view = make_view(name, size, reads=1 if name in OF_RAYS else None)
@@ -181,9 +181,9 @@ def test_a_unet_sees_every_view_and_brings_its_result_back(name):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ONE_PICTURE)
-@every_lens
-def test_the_convolutional_unet_sees_pixels_and_rays_of_every_view(name, lens):
+@pytest.mark.parametrize(("name", "kind"), product(ONE_PICTURE, LENSES))
+def test_the_convolutional_unet_sees_pixels_and_rays_of_every_view(name, kind):
+    lens = LENSES[kind]
     model = create_model(
         "conv_unet_nano", widths=(4, 6), view=name, size=32, task="distance"
     ).eval()

@@ -70,7 +70,7 @@ def is_whole(mask):
 
 @pytest.mark.parametrize(
     "name",
-    [n if n in ("mercator", "tiles") else pytest.param(n, marks=pytest.mark.slow)
+    [n if n == "tiles" else pytest.param(n, marks=pytest.mark.slow)
      for n in OF_PIXELS],
 )  # fmt: skip
 def test_labels_of_every_form_go_through_every_lens_and_view(name):

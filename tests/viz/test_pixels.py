@@ -136,6 +136,7 @@ def test_predictions_of_labels_stand_beside_the_truth(tmp_path):
     assert cv2.imread(str(tmp_path / "labels.png")).std() > 20
 
 
+@pytest.mark.slow
 def test_many_classes_leave_the_pictures_their_size():
     truth, image = np.zeros((20, 20), np.int64), np.zeros((20, 20, 3), np.uint8)
     widths = []
