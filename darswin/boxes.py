@@ -339,7 +339,7 @@ def _like(given: Any, value: np.ndarray) -> Any:
         torch = sys.modules["torch"]
         dtype = given.dtype if value.dtype.kind == "f" and given.is_floating_point() else None
         return torch.from_numpy(np.ascontiguousarray(value)).to(given.device, dtype)
-    dtype = np.asarray(given).dtype
+    dtype = np.asarray(given).dtype.newbyteorder("=")
     both_float = value.dtype.kind == "f" and dtype.kind == "f"
     return value.astype(dtype, copy=False) if both_float else value
 

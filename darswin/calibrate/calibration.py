@@ -11,6 +11,7 @@ from torch import Tensor
 from darswin.calibrate.refine import Free
 from darswin.lens import Lens, to_dict
 from darswin.lens.fitting import slopes_of
+from darswin.utils.arrays import as_tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +67,7 @@ class Calibration:
         Pixels are (..., 2). As mrcal defines it, the point stays fixed with respect to the boards:
         its ray moves with the mean rotation of the poses. NaN where no ray lands.
         """
-        pixels = torch.as_tensor(pixels, dtype=torch.float64)
+        pixels = as_tensor(pixels, torch.float64)
         lens = self.lens.with_theta_max(None)
         rays, count = lens.unproject_points(pixels.reshape(-1, 2)), len(self._vector)
 
@@ -81,7 +82,7 @@ class Calibration:
 
     def uncertainty_of_theta(self, theta: Any) -> Tensor:
         """(...,) px: the standard deviation of the radius r(θ), for θ (...,) rad."""
-        theta = torch.as_tensor(theta, dtype=torch.float64)
+        theta = as_tensor(theta, torch.float64)
         slopes = slopes_of(
             lambda vectors: self._free.at(vectors, self.lens.theta_limit).project(
                 theta.view(1, -1)

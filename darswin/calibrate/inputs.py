@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate.refine import Views
+from darswin.utils.arrays import as_tensor
 from darswin.utils.parameters import check, naming
 
 LEAST_CORNERS, LEAST_PICTURES = 8, 3
@@ -18,7 +19,7 @@ class CalibrationError(ValueError):
 
 def _numbers(name: str, value: Any) -> Tensor:
     try:
-        return torch.as_tensor(value, dtype=torch.float64)
+        return as_tensor(value, torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise naming(TypeError(f"`{name}` must be numbers, got {value!r:.200}"), name) from error
 

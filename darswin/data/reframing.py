@@ -129,6 +129,7 @@ class Reframing:
         y = np.rint(y + c * across + d * down[:, None])
         height, width = target.shape
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        target = np.asarray(target, target.dtype.newbyteorder("="))
         found = target.ravel().take((y * width + x).astype(np.intp), mode="clip")
         found[~inside] = nothing_of(target)
         return found

@@ -30,6 +30,7 @@ def remap(
     image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR
 ) -> np.ndarray:
     """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; 0 outside it."""
+    image = np.asarray(image, image.dtype.newbyteorder("="))  # else OpenCV misreads it
     # With x and y in one array the second map is None, which OpenCV's types do not allow.
     return cv2.remap(image, places, None, interpolation)  # type: ignore[call-overload]
 

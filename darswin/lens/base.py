@@ -12,6 +12,7 @@ from torch import Tensor
 from darswin.lens.image import LensInImage, Size
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of, vector_of
+from darswin.utils.arrays import as_tensor
 from darswin.utils.nearest import did_you_mean
 
 # A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
@@ -361,7 +362,7 @@ def naming_degrees(angle: str, degrees: Any) -> Iterator[None]:
 
 def with_rounded_theta_max(lens: Lens, theta_max: Number) -> Lens:
     """A lens with another θ_max, rad, which may exceed the limit by rounding."""
-    wanted = torch.as_tensor(theta_max, dtype=lens.theta_max.dtype)
+    wanted = as_tensor(theta_max, lens.theta_max.dtype)
     return lens.with_theta_max(_without_rounding(wanted, lens.theta_limit))
 
 

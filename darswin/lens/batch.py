@@ -12,6 +12,7 @@ from torch.utils import _pytree as pytree
 from darswin.lens.parameter import Arguments, Number, Parameter, as_tensors
 from darswin.ops.checks import readable
 from darswin.utils.angles import degrees_hint
+from darswin.utils.arrays import as_tensor
 
 NUMBER = Parameter()
 
@@ -129,7 +130,7 @@ class LensBatch:
 
     def _aligned(self, value: Number, *names: str) -> tuple[Tensor, ...]:
         """`value` and the named parameters, shaped to broadcast along the first dimension."""
-        x = torch.as_tensor(value, dtype=self.theta_max.dtype, device=self.theta_max.device)
+        x = as_tensor(value, self.theta_max.dtype, self.theta_max.device)
         if x.dim() == 0:
             x = x[None]
         if self.count != 1 and x.shape[0] not in (1, self.count):

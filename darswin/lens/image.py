@@ -11,6 +11,7 @@ from darswin.lens.batch import LensBatch
 from darswin.lens.parameter import Parameter
 from darswin.lens.solve import solve
 from darswin.ops.checks import tensor_there
+from darswin.utils.arrays import as_tensor
 
 Size = tuple[int, int] | None  # (H, W) px
 
@@ -43,7 +44,8 @@ class LensInImage(LensBatch):
 
     def from_pixels(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """The inverse of `to_pixels`."""
-        flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
+        (pixels,) = self._aligned(pixels)
+        flat = pixels - self._row(self.center_in(image_size), pixels.dim())
         # `torch.linalg.inv` would wait for the device, and ONNX has none.
         return flat if self.affine is None else solve(self._row(self.affine, flat.dim() + 1), flat)
 
@@ -134,7 +136,7 @@ class LensInImage(LensBatch):
 def _plain(value: Any) -> Any:
     """A number as a float, or several numbers as a list, from Python, NumPy or torch."""
     try:
-        return torch.as_tensor(value, dtype=torch.float64).tolist()
+        return as_tensor(value, torch.float64).tolist()
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"an image has whole pixels, got {value!r}") from error
 

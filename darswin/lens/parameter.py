@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from darswin.utils.arrays import as_tensor
+
 Number = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 
@@ -118,7 +120,7 @@ def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:
     tensors = {}
     for name, value in values.items():
         try:
-            tensors[name] = torch.as_tensor(value, dtype=dtype, device=device)
+            tensors[name] = as_tensor(value, dtype, device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(f"{name} must be a number or a tensor, got {value!r}") from error
     return tensors

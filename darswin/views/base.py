@@ -19,6 +19,7 @@ from darswin.ops.checks import (
     tensor_there,
 )
 from darswin.ops.reference import normalized
+from darswin.utils.arrays import as_tensor
 
 Pair = tuple[int, int]
 PerChannel = float | Sequence[float]
@@ -324,7 +325,7 @@ def _exactly(
         raise ValueError(f"points must have shape (..., 2), got {shape}")
     if not isinstance(points, Tensor):
         places = np.asarray(points)
-        exact = torch.from_numpy(places.astype(np.float64))
+        exact = as_tensor(places, torch.float64)
         moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
         return moved.numpy().astype(np.result_type(places, np.float32), copy=False)
     moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]

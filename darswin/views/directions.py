@@ -14,6 +14,7 @@ from darswin.lens.pixels import as_map, ray_channels
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
 from darswin.utils.angles import check_turn, degrees_hint
+from darswin.utils.arrays import as_tensor
 from darswin.views.base import Pair, PerChannel, PixelView, Prepared, check_lens
 
 Vector = Sequence[float] | Tensor
@@ -359,7 +360,7 @@ def up_of(
         )
     if roll or pitch:
         raise ValueError("give either extrinsics, or roll and pitch")
-    pose = torch.as_tensor(extrinsics, dtype=torch.float64)
+    pose = as_tensor(extrinsics, torch.float64)
     shape = tuple(pose.shape)
     rotation = pose[:3, :3] if shape in ((3, 3), (3, 4), (4, 4)) else pose.new_zeros(3, 3)
     turns = torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4)

@@ -29,6 +29,7 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
+from darswin.utils.arrays import as_tensor
 from darswin.utils.files import replace_file
 from darswin.views import PixelView, PolarGrid, PolarView
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
@@ -165,7 +166,7 @@ def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
 def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes) -> None:
     """Draws the polar image, without jitter: rows are radii, columns are azimuths."""
     lens, grid = _grid(lens, sampler, image)
-    pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
+    pixels = as_tensor(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
     # The last channel is the fraction of a sample that lies in the image.
     pixels = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
     arguments = sampler.arguments(pixels, grid) | dict(jitter=0.0)

@@ -133,7 +133,8 @@ def from_binary(data: bytes, most: int) -> str:
             if not 0 <= model < len(NUMBERED):
                 raise ValueError(
                     f"camera {camera}, model must be a number from 0 ({NUMBERED[0]}) to "
-                    f"{len(NUMBERED) - 1} ({NUMBERED[-1]}), got {model}"
+                    f"{len(NUMBERED) - 1} ({NUMBERED[-1]}), got {model}; images.bin and "
+                    "points3D.bin have no cameras"
                 )
             name = NUMBERED[model]
             values = struct.Struct(f"<{len(MODELS[name][1].split())}d")

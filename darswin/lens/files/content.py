@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from darswin.lens.files.fields import is_number
+from darswin.lens.files.fields import is_number, listed
 from darswin.utils.text import mapping, parse_json, to_text
 
 # A mapping from YAML, JSON or XML; or rows of words, from a plain table.
@@ -48,6 +48,7 @@ _OTHERS = {
     ),
     "a PDF document": rb"%PDF",
     "a file of MATLAB or HDF5": rb"MATLAB 5|\x89HDF",
+    "a ROS bag or a database": rb"#ROSBAG V|\x89MCAP0|SQLite format 3\0",
     "one array of NumPy (np.savez writes several with their names)": rb"\x93NUMPY",
     "a pickle, which may run code": rb"\x80[\x02-\x05][^\0]",
 }  # fmt: skip
@@ -136,7 +137,8 @@ def _parse_table(text: str) -> list[list[str]]:
 
 
 def _parse_yaml(text: str) -> Mapping:
-    """Parses YAML. Scalars stay text, and tags such as !!opencv-matrix are ignored."""
+    """Parses YAML. Scalars stay text, and tags such as !!opencv-matrix are ignored. Of several
+    documents, as `rostopic echo` writes them, all must be the same but for their header."""
     # OpenCV begins its files with %YAML:1.0, which is not valid YAML.
     text = re.sub(r"\A%YAML[^\n]*\n", "", _limited("YAML", text, MAX_YAML))
     lines = text.split("\n")
@@ -145,15 +147,24 @@ def _parse_yaml(text: str) -> Mapping:
     if text.count("[") + text.count("{") > text.count("]") + text.count("}") + MAX_OPEN:
         raise RecursionError  # the parser takes a second until it raises this
     try:
-        content = yaml.load("\n".join(lines), _Loader)
+        # An empty document is an empty text.
+        documents = [*filter(None, yaml.load_all("\n".join(lines), _Loader))]
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "
         problem = str(getattr(error, "problem", error)).splitlines()[0]
         raise ValueError(f"it is not valid YAML: {where}{problem}") from error
-    if not isinstance(content, Mapping):
+    if not documents or not all(isinstance(content, Mapping) for content in documents):
         raise ValueError("it must be a mapping (YAML, JSON or XML) or a table of numbers")
-    return content
+    first, *others = documents
+    for number, other in enumerate(others, 2):
+        names = dict.fromkeys((*first, *other))
+        if apart := [n for n in names if n != "header" and first.get(n) != other.get(n)]:
+            raise ValueError(
+                f"it is not valid YAML of one camera: the documents 1 and {number}, with --- "
+                f"between them, differ in {listed(apart)}: keep one of them"
+            )
+    return first
 
 
 class _Loader(yaml.BaseLoader):

@@ -22,7 +22,7 @@ from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
 from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
-from darswin.lens.files.unknown import unknown
+from darswin.lens.files.unknown import program_of, unknown
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
@@ -38,6 +38,7 @@ FORMATS: tuple[Format, ...] = (
     Own(), WoodScape(), Basalt(), Nerfstudio(), CamOdoCal(), Kalibr(), opencv.ByName(),
     opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
+_UNKNOWN = "unknown format: {}. The formats are " + ", ".join(format.name for format in FORMATS)
 # The formats that `save` writes.
 WRITTEN: dict[str, Format] = {
     "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": Kalibr()
@@ -142,7 +143,7 @@ class Calibration:
     """A parsed calibration file: its format and its cameras, which are read on demand."""
 
     def __init__(self, text: str, name: str, coefficients: str | None = None):
-        self.what = f"calibration {name}"  # for errors
+        self.what, self._text = f"calibration {name}", text  # for errors
         with self._about():
             content = parse(text)
             self.format = _format_of(content)
@@ -298,12 +299,17 @@ class Calibration:
 
     @contextmanager
     def _about(self, camera: str | None = None) -> Iterator[None]:
-        """Adds the file to errors, and the camera if there are several."""
+        """Adds the file to errors, and the camera if there are several. Of another program's file,
+        the error names the program: what a format misses in it would lead astray."""
         try:
             yield
         except ValueError as error:
             if str(error).startswith(self.what):
                 raise
+            if program := program_of(self._text):
+                what = self.what[self.what.index("calibration ") :]
+                text = f"{what}: {_UNKNOWN.format(program)}"
+                raise ValueError(text) from error
             which = f"camera {short(camera)}: " if camera and len(self.names) > 1 else ""
             raise ValueError(f"{self.what}: {which}{error}") from error
 
@@ -311,9 +317,7 @@ class Calibration:
 def _format_of(content: Content) -> Format:
     found = next((format for format in FORMATS if format.recognizes(content)), None)
     if found is None:
-        known = ", ".join(format.name for format in FORMATS)
-        reason = unknown(content, FORMATS)
-        raise ValueError(f"unknown format: {reason}. The formats are {known}")
+        raise ValueError(_UNKNOWN.format(unknown(content, FORMATS)))
     return found
 
 

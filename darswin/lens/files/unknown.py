@@ -10,13 +10,52 @@ from darswin.lens.files.format import Format
 from darswin.utils.nearest import nearest
 
 _MOST = 20  # entries that are compared
-# Other programs, entries that their files have, and the program whose format they can write.
+_LOOKED_AT = 1 << 20  # characters
+_FOR_OPENCV, _FOR_COLMAP = (f"let it write the cameras for {to}" for to in ("OpenCV", "COLMAP"))
+# Other programs, the names that all of their files have, and what to do.
 PROGRAMS = (
-    ("Metashape", {"projection", "f"}, "OpenCV"),
-    ("Metashape", {"chunk"}, "OpenCV"),
-    ("OpenMVG", {"sfm_data_version", "intrinsics"}, "COLMAP"),
-    ("Meshroom", {"views", "intrinsics", "poses"}, "COLMAP"),
-)
+    ("PhotonVision", r'"cameraIntrinsics" "distCoeffs"', "write its matrix, coefficients and "
+     "resolution as OpenCV's"),
+    ("mrcal", "lensmodel LENSMODEL_", "mrcal-to-kalibr converts it"),
+    ("MATLAB", "RadialDistortion TangentialDistortion", "cameraIntrinsicsToOpenCV converts it"),
+    ("MATLAB", "MappingCoefficients StretchMatrix", "write it as an OCam lens of darswin, whose "
+     "pixels begin at 0"),
+    ("the Camera Calibration Toolbox for MATLAB", r"\bfc\s*=\s*\[ \bkc\s*=\s*\[ \bcc\s*=\s*\[",
+     "write fc, cc and kc as OpenCV's, whose pixels begin at 0"),
+    ("Metashape", "<projection> <f>", _FOR_OPENCV),
+    ("Metashape", "<document <chunk", _FOR_OPENCV),
+    ("OpenMVG", '"sfm_data_version" "intrinsics"', _FOR_COLMAP),
+    ("Meshroom", '"views" "intrinsics" "poses"', _FOR_COLMAP),
+    ("OpenSfM", '"projection_type" "focal', _FOR_COLMAP),
+    ("Kalibr's report", r"Camera-system\sparameters:", "take the camchain file beside it"),
+    ("Kalibr's boards", r"\btarget_type: \b(?:tag|target)Cols:", "take the camchain file"),
+    ("ORB-SLAM", r"\bCamera\d?\.fx \bCamera\d?\.cx", "write its numbers as OpenCV's"),
+    ("stella_vslam", r"^Camera: \bsetup: \bcolor_order:", "write its numbers as OpenCV's"),
+    ("COLMAP's images and points", r"^\d+(?:\s[-+.\de]+){8}\s(\S+\.\w+)$|^#\s3D\spoint\slist",
+     "take cameras.txt beside it"),
+    ("KITTI", r"^(?:K_0\d|P\d|P_rect_0\d):", "its pictures follow a pinhole, whose matrix it has"),
+    ("Cityscapes", '"intrinsic" "u0" "v0" "baseline"', "its pictures follow a pinhole, with fx, "
+     "fy, u0 and v0"),
+    ("DepthAI", '"cameraData" "boardName"', "write one of its cameras as OpenCV's"),
+    ("Azure Kinect", '"CalibrationInformation" "ModelParameters"', "write one of its cameras as "
+     "OpenCV's"),
+    ("Gyroflow", '"fisheye_params" "calib_dimension"', "write its matrix, coefficients and size "
+     "as OpenCV's"),
+    ("ROS bags", "rosbag2_bagfile_information", "take the camera_info message in the bag"),
+)  # fmt: skip
+
+
+def program_of(text: str) -> str:
+    """The program whose file a text is, and what to do, in words; "" if it is not known."""
+    text = text[:_LOOKED_AT]
+    for program, names, advice in PROGRAMS:
+        found = [re.search(name, text, re.MULTILINE) for name in names.split(" ")]
+        if all(found):
+            shown = listed(
+                match[match.lastindex or 0].strip('<>"=[:# ') for match in found if match
+            )
+            return f"its entries are {shown}, as in files of {program}: {advice}"
+    return ""
 
 
 def unknown(content: Content, formats: Sequence[Format]) -> str:
@@ -25,9 +64,6 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
         tables = " or ".join(format.keys for format in formats if format.is_table)
         return f"it is a table of {len(content)} lines, but a table must have {tables}"
     found = f"its entries are {listed(content) or 'none'}"
-    for program, entries, other in PROGRAMS:
-        if entries <= content.keys():
-            return f"{found}, as in files of {program}: let it write the cameras for {other}"
     given = content.get("model")
     if isinstance(given, str):
         return f"{found}; in a darswin file, {unknown_model(given)}"
