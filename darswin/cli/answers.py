@@ -42,6 +42,7 @@ Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # takes a half to a third of the time of single images
 ANSWERS = "predictions.json"
+TOP = 5  # classes of a picture that are listed
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
 
@@ -71,6 +72,10 @@ class Answers:
 
     def flush(self) -> None:
         """Predicts the images that wait."""
+
+    def finish(self) -> str | None:
+        """What is wrong with all answers, once they are there."""
+        return None
 
     def _once(self, lens: Lens, make: Callable[[], Any]) -> Any:
         """What `make` makes of a lens, made once for each of the last lenses."""

@@ -173,8 +173,8 @@ class PixelModule(TaskModule):
     # -- evaluation ---------------------------------------------------------------------------
 
     def _predict(self, batch: Batch, measured: Measured) -> tuple[Tensor, Tensor]:
-        """The answer for each pixel and a mask of the known pixels that have an answer; adds the loss
-        of these."""
+        """The answer for each pixel and a mask of the known pixels that have one; adds the loss of
+        these."""
         images, lens, target = batch
         measured.asked.update(self._known(target).sum())
         predicted, shown = self._run(images, lens.merged())

@@ -1,26 +1,21 @@
 """The seam between lenses and networks: what a view is."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.lens import Lens
-from darswin.lens.pixels import OUTSIDE, ray_channels, sample_at
 from darswin.ops.checks import (
     FRAME_CHANNELS,
     channels_first,
     check_has_batch,
-    check_pair,
     per_channel,
     readable,
-    tensor_there,
 )
 from darswin.ops.reference import normalized
-
 
 Pair = tuple[int, int]
 PerChannel = float | Sequence[float]

@@ -25,7 +25,7 @@ _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sp
 _STEPS = 361  # points at which the end of what a lens sees is looked for
 _BISECTIONS = 12
 _LEAST_STEP = 1e-9  # of a view whose middle the picture does not show
-_SEAM = 1e-3  # px: a view that lacks less than this goes all around
+_SEAM = 1e-3  # px that a view may lack and still goes all around
 _APART = 1.5  # pixels of the image between points at which it is read
 _USUAL_READS = 4  # at most, unless `reads` says more
 MOST_READS = 16  # that a plan of `darswin.frames` can hold
@@ -154,8 +154,7 @@ class RayView(PixelView):
     def goes_around(self, lens: Lens, size: Pair) -> Tensor | None:
         if not self.upright:
             return None
-        step, _ = self._layout(lens, size)
-        around = step[:, 0] * (self.size[1] + _SEAM) >= 2 * math.pi
+        around = self._layout(lens, size)[0][:, 0] * (self.size[1] + _SEAM) >= 2 * math.pi
         return around if not readable(around) or around.any() else None
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:

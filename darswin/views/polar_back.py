@@ -30,7 +30,7 @@ def resized_around(maps: Tensor, size: Pair) -> Tensor:
 
 
 def places_of(maps: Tensor) -> Tensor:
-    """The places in polar maps (B, R, A, K): cos φ, sin φ and the number of the ring, (1, R, A, 3)."""
+    """The places in polar maps (B, R, A, K), (1, R, A, 3): cos φ, sin φ, the number of the ring."""
     rings, sectors = maps.shape[1:3]
     ring, sector = (torch.arange(side, device=maps.device) for side in (rings, sectors))
     along = direction_of((sector + 0.5) * (2 * math.pi / sectors)).expand(rings, -1, -1)
