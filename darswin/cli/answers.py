@@ -42,6 +42,7 @@ Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # takes a half to a third of the time of single images
 ANSWERS = "predictions.json"
+TOP = 5  # classes of a picture that are listed
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
 
@@ -71,6 +72,10 @@ class Answers:
 
     def flush(self) -> None:
         """Predicts the images that wait."""
+
+    def finish(self) -> str | None:
+        """What is wrong with all answers, once they are there."""
+        return None
 
     def _once(self, lens: Lens, make: Callable[[], Any]) -> Any:
         """What `make` makes of a lens, made once for each of the last lenses."""
@@ -106,7 +111,7 @@ class ModelAnswers(Answers):
                     size = (pixels.shape[2], pixels.shape[3])
                     prepared = self.model.prepare(resized_lens, size)
                 self._warn_of_cut_off(lens)
-                return prepared, self._full_size(lens)
+                return prepared, self._full_size(lens, prepared)
 
             self._prepared: tuple[Prepared, FullSize | None] = self._once(lens, prepare)
             self._lens = lens
@@ -142,7 +147,7 @@ class ModelAnswers(Answers):
             outputs = self._run(images, prepared)
         self.seconds += time.perf_counter() - start
         for request, output in zip(queue, outputs, strict=True):
-            # Only pixels that a ray reaches have a prediction.
+            # Only pixels that a ray reaches and the view shows have a prediction.
             used = output if full is None else output[:, torch.from_numpy(full.reached)]
             if not used.isfinite().all():
                 raise FloatingPointError(
@@ -151,7 +156,7 @@ class ModelAnswers(Answers):
                 )
             self.found.append(request.entry | self._answer(request, output, full))
 
-    def _full_size(self, lens: Lens) -> FullSize | None:
+    def _full_size(self, lens: Lens, prepared: Prepared) -> FullSize | None:
         """The mapping to the pixels of the lens's pictures, if the predictions need it."""
         return None
 
@@ -195,8 +200,8 @@ class PixelAnswers(ModelAnswers):
         super().__init__(fast(model, card), card)
         self.out, self.names = out, names
 
-    def _full_size(self, lens: Lens) -> FullSize:
-        return FullSize(lens, self.card.size, framing_of(self.model, self.card))
+    def _full_size(self, lens: Lens, prepared: Prepared) -> FullSize:
+        return FullSize(lens, self.card.size, framing_of(self.model, self.card), prepared.shown)
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.model.run(images, prepared)

@@ -4,6 +4,7 @@ import io
 import math
 import re
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,21 +14,69 @@ import numpy as np
 import torch
 
 from darswin import boxes
-from darswin.cli.answers import Answers, file_of, label_png, said, write_overlay
+from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_overlay
+from darswin.cli.names import read_names
 from darswin.cli.views import named_view
 from darswin.data.scenes.targets import IGNORE
-from darswin.data.splits import read_list
 from darswin.deploy.network import Detections, OnnxNetwork
 from darswin.frames import Plan, Sampler, plan
 from darswin.lens import Lens
 from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
-from darswin.utils.parameters import check, naming
+from darswin.utils.parameters import check, check_statistics, naming
 from darswin.views import PlainView
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
+
+
+class Logits(UserWarning):
+    """A note on outputs that become probabilities."""
+
+
+class Emptied(UserWarning):
+    """A warning of boxes that were left out because they are none."""
+
+
+class Boxes:
+    """Counts the boxes of a network that have no area, and those that are within its first pixels,
+    where no thing is."""
+
+    smallest = 2.0  # px
+
+    def __init__(self) -> None:
+        self.count = self.without_area = self.in_corner = 0
+
+    def add(self, found: Sequence[Detections]) -> None:
+        for given, *_ in found:
+            has_area = (given[:, :2] < given[:, 2:]).all(1)
+            in_corner = (np.abs(given) < self.smallest).all(1)
+            self.count += len(given)
+            self.in_corner += int(in_corner.sum())
+            self.without_area += int((~has_area & ~in_corner).sum())
+
+    def wrong(self, network: str) -> str | None:
+        """What is wrong if most boxes are none; warns if some are."""
+        wrong = self.without_area + self.in_corner
+        if not wrong:
+            return None
+        text = (
+            f"{wrong} of {self.count} boxes of {network} were left out: {self.without_area} "
+            f"without an area, and {self.in_corner} within the first {self.smallest:g} px"
+        )
+        if 2 * wrong <= self.count:
+            warnings.warn(text, Emptied, stacklevel=2)
+            return None
+        hints = []
+        if self.without_area:
+            hints.append("centres and sizes, or y before x")
+        if self.in_corner:
+            hints.append("parts of the picture, which its width and height multiply")
+        return (
+            f"{text}. They may be {' or '.join(hints)}; the graph must give the corners x0, y0, "
+            "x1, y1 in pixels"
+        )
 
 
 class Seen(NamedTuple):
@@ -54,14 +103,13 @@ class NetworkAnswers(Answers):
         fov_deg: float | None = None, up: Sequence[float] | None = None,
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
+        top: int | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
-        for name, values in (("threshold", (lowest,)), ("mean", mean or ()), ("std", std or ())):
-            given = ",".join(f"{value:g}" for value in values)
-            check(name, given, all(map(math.isfinite, values)), "finite")
+        check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")
+        check_statistics(mean, std)
         check("size", size, size is None or min(size) >= 1, "at least 1,1")
-        for value in mean or ():
-            check("mean", f"{value:g}", abs(value) <= 1, "in parts of 255, at most 1")
+        self.labels = None if labels is None else read_names(labels)
         make = partial(
             named_view, "view", view or VIEW, fov_deg=fov_deg, up=up, mean=mean or (0.0,),
             std=std or (1.0,),
@@ -79,8 +127,27 @@ class NetworkAnswers(Answers):
         self._mean, self._std = (
             per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
         )
-        self.labels = None if labels is None else read_list(labels)
         self._step = -1 if channels == "bgr" else 1
+        self._top, asked = top or TOP, top is not None or labels is not None
+        self._classes = self._class_outputs() if asked else []
+        self._boxes = Boxes()
+
+    def _class_outputs(self) -> list[str]:
+        """The outputs that are numbers of classes, if these were asked for."""
+        network = self.network
+        if network.kind != "numbers":
+            return []
+        counts = {name: shape[0] for name, shape in network.shapes.items() if len(shape) == 1}
+        wanted = None if self.labels is None else max(self.labels) + 1
+        found = [name for name, count in counts.items() if count == wanted or wanted is None]
+        if not found:
+            given = ", ".join(f"{count} in {name}" for name, count in counts.items())
+            text = f"`labels` names the classes 0 to {(wanted or 0) - 1}, but {network.path} gives"
+            raise naming(ValueError(f"{text} other numbers of classes: {given}"), "labels")
+        return found
+
+    def finish(self) -> str | None:
+        return self._boxes.wrong(self.network.path)
 
     def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
         """Says where files go, which numbers do not need; names: those of `file_names`."""
@@ -135,6 +202,7 @@ class NetworkAnswers(Answers):
     ) -> dict[str, Any]:
         """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
         size, parts = image.shape[:2], []
+        self._boxes.add(found)
         for tile, (inner, *others) in enumerate(found):
             inner = boxes.clip(inner, self.network.size)
             carried, visible = boxes.carry(inner, partial(seen.sampler.plan.points, tile=tile))
@@ -177,9 +245,10 @@ class NetworkAnswers(Answers):
         """The name of a class, or its number if there are no names."""
         if self.labels is None:
             return label
-        if not 0 <= label < len(self.labels):
-            text = f"{self.network.path} found class {label}, but `labels` has {len(self.labels)}"
-            raise naming(ValueError(f"{text} names, from 0"), "labels")
+        if label not in self.labels:
+            count = f"{len(self.labels)} names, from {min(self.labels)} to {max(self.labels)}"
+            text = f"{self.network.path} found class {label}, but `labels` has {count}, without it"
+            raise naming(ValueError(text), "labels")
         return self.labels[label]
 
     def _outputs(
@@ -189,26 +258,57 @@ class NetworkAnswers(Answers):
         answer: dict[str, Any] = {}
         for output, values in found.items():
             if values.ndim < 4:
-                answer[output] = (values[0] if len(values) == 1 else values).tolist()
+                each = [self._best(v) if output in self._classes else v.tolist() for v in values]
+                answer[output] = each[0] if len(each) == 1 else each
                 continue
             folder = re.sub(r"[^\w.-]", "_", output)
             name = f"{folder}/{file_of(entry, self._names)}"
-            seen_pixels = np.ones_like(values[:, :1])
-            maps = torch.from_numpy(np.concatenate((values, seen_pixels), 1)).float()
+            is_ids = values.dtype.kind in "biu"  # of classes or things
+            maps = torch.from_numpy(values.astype(np.int64 if is_ids else np.float32))
             with torch.inference_mode():
-                *planes, reached = self.view.back(maps, seen.back)[0].numpy()
+                planes = self.view.back(maps, seen.back)[0].numpy()
             content = io.BytesIO()
-            np.save(content, np.stack(planes))
+            np.save(content, planes)
             replace_file(self._out / f"maps/{name}.npy", content.getbuffer())
             answer[output] = {"map": f"maps/{name}.npy"}
-            if 2 <= len(planes) <= IGNORE:
-                labels = np.where(reached > 0.5, np.argmax(planes, 0), IGNORE).astype(np.uint8)
-                colors = palette(len(planes))
-                replace_file(self._out / f"labels/{name}.png", label_png(labels, colors))
-                laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
-                answer[output]["labels"] = f"labels/{name}.png"
-                answer[output]["overlay"] = write_overlay(self._out, name, laid)
+            labels = planes[0] if is_ids and len(planes) == 1 else np.argmax(planes, 0)
+            if len(planes) > IGNORE or (len(planes) == 1 and not is_ids):
+                continue
+            if labels.min() < 0 or labels.max() > IGNORE:
+                continue  # ids of things
+            if seen.back.shown is not None:
+                labels = np.where(seen.back.shown[0], labels, IGNORE)
+            colors = palette(IGNORE if is_ids else len(planes))
+            answer[output] |= self._labels(name, image, labels.astype(np.uint8), colors)
         return answer
+
+    def _labels(
+        self, name: str, image: np.ndarray, labels: np.ndarray, colors: Sequence[Any]
+    ) -> dict[str, Any]:
+        """Writes ids (H, W) as a PNG, and on the picture."""
+        counts = np.bincount(labels.ravel(), minlength=IGNORE + 1)[:IGNORE]
+        replace_file(self._out / f"labels/{name}.png", label_png(labels, colors))
+        laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
+        answer: dict[str, Any] = {"labels": f"labels/{name}.png"}
+        answer["overlay"] = write_overlay(self._out, name, laid)
+        if self.labels is not None:
+            shares = (counts / max(1, counts.sum())).round(6).tolist()
+            answer["shares"] = {str(self._name(k)): s for k, s in enumerate(shares) if counts[k]}
+        return answer
+
+    def _best(self, values: np.ndarray) -> list[dict[str, Any]]:
+        """The `top` classes of one picture."""
+        values = values.astype(np.float64)
+        key = "probability"
+        if values.min() < 0 or values.max() > 1:
+            text = f"{self.network.path} gives logits: their softmax are the probabilities"
+            warnings.warn(text, Logits, stacklevel=2)
+            values = np.exp(values - values.max())
+            values /= values.sum()
+        elif abs(values.sum() - 1) > 1e-2:  # of half precision
+            key = "score"  # of each class on its own
+        best = np.argsort(-values, kind="stable")[: self._top]
+        return [{"class": self._name(int(k)), key: round(float(values[k]), 6)} for k in best]
 
 
 def _rounded(values: Any, digits: int) -> Any:

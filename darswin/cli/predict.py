@@ -10,7 +10,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
+from darswin.cli.answers import (
+    ANSWERS,
+    ANSWERS_OF,
+    TOP,
+    Answers,
+    ClassAnswers,
+    claim_folder,
+    file_names,
+)
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
 from darswin.cli.options import check_folder
@@ -23,7 +31,7 @@ from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import check_is_file, replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
-from darswin.utils.parameters import check, with_flags
+from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_video, read_frames
@@ -39,7 +47,7 @@ class File(NamedTuple):
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
     model: str | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None, task: Task | None = None, top: int = 5,
+    coefficients: Coefficients | None = None, task: Task | None = None, top: int | None = None,
     every: int = 1, out: str | None = None, network: str | None = None, view: str | None = None,
     size: tuple[int, int] | None = None, fov_deg: float | None = None,
     up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
@@ -72,7 +80,8 @@ def predict(
         camera: the name or number of the camera, if the calibration has several.
         coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         task: the task that the model must have. Another model is an error.
-        top: the number of classes to list for each image.
+        top: the number of classes to list for each image. The default is 5. A network in an ONNX
+            file then gives classes in place of numbers.
         every: the step between the frames of a video that are predicted; 1 predicts all.
         out: the JSON file to write; without it, classes are printed. For segmentation and
             distance, a folder that is new, empty, or from an earlier predict. It gets
@@ -82,7 +91,8 @@ def predict(
             predictions.json; the numbers of a network without boxes and maps are printed.
         network: in place of a run, an ONNX file of any network. Its outputs are boxes, scores and
             labels by these names, one output (B, N, 6) of x0, y0, x1, y1, score and class, maps
-            (B, K, H, W), or numbers (B, K). It needs onnxruntime, of the extra onnx.
+            (B, K, H, W) of the size of the view or of a whole fraction of it, or numbers (B, K). It
+            needs onnxruntime, of the extra onnx.
         view: what the network sees of the pictures, by its lens: the name of a view of
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
@@ -93,11 +103,12 @@ def predict(
             default is the top of the picture, 0,-1,0.
         mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
             one for each channel. The default is 0.
-        std: the same for std. The default is 1.
+        std: the same for std. The default is 1. Divide numbers for pixels from 0 to 255 by 255.
         channels: the order of colours that the network expects. The default is rgb.
         threshold: the lowest score of boxes. The default is 0.3.
-        labels: a file with the names of the network's classes, from class 0: a text file with a
-            name in each line, or a JSON list.
+        labels: a file with the names of the network's classes: a text file, whose line k names
+            class k, from 0, and whose empty lines are no classes; JSON or YAML with a list or with
+            {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt).
     """
     options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
@@ -120,7 +131,7 @@ def predict(
         assert network is not None
         weights = network
     for name, value in (("top", top), ("every", every)):
-        check(name, value, value >= 1, "at least 1")
+        check(name, value, value is None or value >= 1, "at least 1")
     if not paths and lens is None and model in list_pretrained():
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths:
@@ -129,14 +140,17 @@ def predict(
         raise ValueError("missing --lens: give the camera's calibration file")
     check_paths(paths)
     if network is None:
-        kind, make = _of_model(weights, top)
+        kind, make = _of_model(weights, TOP if top is None else top)
     else:
         from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
 
-        through = NetworkAnswers(network, **options)
+        through = NetworkAnswers(network, **options, top=top)
         kind, make = through.network.kind, through.into
     if task not in (None, kind):
         raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
+    if top is not None and kind not in ("classification", "numbers"):
+        text = f"`top` is for the classes of pictures, but {weights} is a model for {kind}"
+        raise naming(ValueError(text), "top")
     prints = kind in ("classification", "numbers")
     files = pictures_and_videos(paths, leave_out=None if prints else out)
     names = [file.name for file in files]
@@ -170,6 +184,8 @@ def predict(
             if found:
                 text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
                 print(text) if out is None else replace_file(out, text)
+    if (wrong := answers.finish()) is not None:
+        raise ValueError("\n".join([wrong, *bad]))
     if bad:
         videos = any(file.is_video for file in files)
         what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")

@@ -96,10 +96,13 @@ def _comparison(
     results = Change()
     with torch.inference_mode():
         for images, lens, target in batches:
-            a, b = model(images, lens).float(), quantized(images, lens).float()
+            prepared = model.prepare(lens, (images.shape[2], images.shape[3]))
+            a, b = model.run(images, prepared).float(), quantized(images, lens).float()
             results.add(a, b)
             before, after = a.argmax(1), b.argmax(1)
             valid = (target >= 0) & (target < a.shape[1])
+            if prepared.shown is not None:
+                valid &= prepared.shown
             pictures, pixels = pictures + len(a), pixels + before.numel()
             known += int(valid.sum())
             right += int((before == target)[valid].sum())

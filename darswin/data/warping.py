@@ -140,29 +140,37 @@ class FullSize:
     """Brings a network's answers for each pixel back to the size of the pictures of one lens.
 
     It undoes `at_size`, with bilinear interpolation between those pixels of the network that a ray
-    reaches. Pixels that "crop" cut off, and pixels beyond θ_max, have no label and no distance.
+    reaches. Pixels that "crop" cut off, pixels beyond θ_max, and those that the model's view does
+    not show, have no label and no distance.
 
     Attributes:
         seen: (H, W), True for pixels that have an answer.
-        reached: (h, w), True for pixels of the network that a ray reaches.
+        reached: (h, w), True for pixels of the network that have an answer.
 
     Args:
         lens: the lens, with the image_size of the pictures. size, fit: those of `at_size`.
+        shown: (1, h, w), the pixels that the model's view shows: `model.prepare(…).shown`. None
+            means that it shows all that the lens sees.
 
     Raises:
         ValueError: a lens without an image_size, or several; an unknown `fit`.
     """
 
-    def __init__(self, lens: Lens, size: int, fit: Fit):
+    def __init__(self, lens: Lens, size: int, fit: Fit, shown: torch.Tensor | None = None):
         if lens.image_size is None or len(lens) != 1:
             raise ValueError("FullSize takes one lens, with the image_size of its pictures")
         top, left, self._height, self._width = taken_part(picture_size(lens), fit)
         self._part = np.s_[top : top + self._height, left : left + self._width]
         self.reached = _reached(lens_at_size(lens, size, fit))
+        whole = np.ones((self._height, self._width), bool)
+        if shown is not None:
+            is_shown = shown.cpu().numpy().reshape(self.reached.shape)
+            self.reached &= is_shown
+            whole = self._enlarged(is_shown) > 0.5
         self._weight = self._enlarged(self.reached)
         reached = _reached(lens)
         self.seen = np.zeros_like(reached)
-        self.seen[self._part] = reached[self._part] & (self._weight > 0)
+        self.seen[self._part] = reached[self._part] & whole & (self._weight > 0)
 
     def labels(self, logits: np.ndarray) -> np.ndarray:
         """The classes with the largest logits.
@@ -186,7 +194,7 @@ class FullSize:
         """Distances; their logarithms are interpolated.
 
         Args:
-            distance: (h, w), m, above 0 for pixels that a ray reaches.
+            distance: (h, w), m, above 0 for pixels that a ray reaches and the view shows.
 
         Returns:
             (H, W) float32, m; 0 without an answer.

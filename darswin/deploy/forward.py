@@ -11,6 +11,7 @@ from darswin.deploy.fast import FastEmbed, FastLayer, FastMerging, FastPatchEmbe
 from darswin.deploy.own import OwnLinear, OwnNorm, pack
 from darswin.deploy.packed import InDtype, OwnBlocks, refuse_gradients
 from darswin.deploy.program import AND_GELU, NOTHING, RUN, Program, Slot, Weights
+from darswin.lens.pixels import OUTSIDE
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import RAYS, DistanceHead, PixelHead
@@ -92,7 +93,8 @@ class _UnetRun:
         inputs = [x.float(), *chain(*prepared.tables), *_place_maps(self.places, prepared)]
         if view.in_pixels:
             (logits,) = RUN([*inputs, *rays], self.weights, self.words)
-            return unet.head.finish(view.back(logits.permute(0, 3, 1, 2), prepared))
+            pixels = view.back(logits.permute(0, 3, 1, 2), prepared)
+            return unet.head.finish(pixels, prepared.shown)
         (maps,) = RUN(inputs, self.weights, self.words)
         pixels = view.back(maps, prepared)
         if unet.refines_with_images:
@@ -102,7 +104,7 @@ class _UnetRun:
             given = [pixels.permute(0, 2, 3, 1), images.float(), *rays]
             (logits,) = RUN(given, self.weights, self._of_head(prepared.size))
             pixels = logits.permute(0, 3, 1, 2)
-        return unet.head.finish(pixels)
+        return unet.head.finish(pixels, prepared.shown)
 
 
 def _share(model: Model, weights: Weights) -> None:
@@ -153,6 +155,7 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
             x = refined(program, model.head, x, pixels)
         if isinstance(model.head, DistanceHead):
             x = program.distance(x, model.head.typical_distance)
+            x = _shown_alone(program, x, prepared, constants)
         results = [program.channels_first(x)]
     for slot in results:
         program.output(slot)
@@ -181,7 +184,20 @@ def _back(
         return program.resized(x, prepared.size)
     points = view.back_points(prepared, x.shape[:2])
     constants.append(points)
+    if prepared.around is not None:
+        x = program.around(x)
     return program.sampled(x, program.input(*points.shape[1:]))
+
+
+def _shown_alone(program: Program, x: Slot, prepared: Prepared, constants: list[Tensor]) -> Slot:
+    """A map of the pixels of the images with 0 where the view shows nothing."""
+    shown = prepared.shown
+    if shown is None or shown.all():
+        return x
+    rows, columns = torch.meshgrid(*map(torch.arange, prepared.size), indexing="ij")
+    pixels = torch.stack((columns, rows), -1)  # read where they are, or outside
+    constants.append(torch.where(shown[..., None], pixels, OUTSIDE))
+    return program.sampled(x, program.input(*pixels.shape))
 
 
 def _results(

@@ -1,7 +1,6 @@
 """Any network of pictures in an ONNX file, run by ONNX Runtime; needs NumPy and onnxruntime."""
 
 import os
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -18,13 +17,10 @@ _CHANNELS = (1, 3)
 _DETECTIONS = ("boxes", "scores", "labels")
 _KNOWN = (
     "known are boxes (B, N, 4), scores (B, N) and labels (B, N) by these names; one output "
-    "(B, N, 6) of x0, y0, x1, y1, score and class; maps (B, K, H, W); and numbers (B, K). A "
-    "network that needs a decoder must have it in its graph"
+    "(B, N, 6) of x0, y0, x1, y1, score and class; maps (B, K, H, W) of the size of the picture or "
+    "of a whole fraction of it; and numbers (B, K). A network that needs a decoder must have it in "
+    "its graph"
 )
-
-
-class PartsOfPicture(UserWarning):
-    """The warning of boxes that seem to be in parts of the picture, and not in pixels."""
 
 
 class Detections(NamedTuple):
@@ -44,7 +40,8 @@ class OnnxNetwork:
 
     A call takes one or several pictures as a `darswin.frames.Sampler` makes them: (n, C, H, W)
     float32, already normalised, or (n, H, W, C) uint8. It returns a list of `Detections` for a
-    detector, and otherwise a dict of the outputs: maps (n, K, H', W') and numbers (n, K).
+    detector, and otherwise a dict of the outputs: numbers (n, K), and maps (n, K, H/k, W/k) with a
+    whole number k. Maps of integers, such as ids of classes, may lack K.
 
     The graph has one input: pictures (B, C, H, W) or (B, H, W, C), or one picture without B; maps
     then have the same order of axes. If the graph does not name its channels, they come first, and
@@ -68,6 +65,7 @@ class OnnxNetwork:
         size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
         output: the output of a `darswin.frames.Plan` that the network takes, "uint8" or "image".
         kind: "detections", "maps", or "numbers".
+        shapes: the shapes of the outputs for one picture, by name; empty for a detector.
     """
 
     def __init__(
@@ -94,8 +92,11 @@ class OnnxNetwork:
         self.batch = batch or (count if count > 1 and self._takes(black) else 1)
         found = self(black)
         self.kind: Literal["detections", "maps", "numbers"] = "detections"
+        self.shapes: dict[str, tuple[int, ...]] = {}
         if isinstance(found, dict):
             self.kind = "maps" if any(v.ndim == 4 for v in found.values()) else "numbers"
+            self.shapes = {name: values.shape[1:] for name, values in found.items()}
+            self._check_heads()
 
     def _read_input(self) -> tuple[tuple[Any, Any], int | None]:
         """Reads the axes of the input in the graph. Returns its (H, W) and its batch, None for
@@ -192,27 +193,47 @@ class OnnxNetwork:
         self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
         if (labels % 1).any():
             raise ValueError(f"{self.path} finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
-        if len(boxes) and boxes.max() <= 1:
-            text = (
-                f"the boxes of {self.path} are all within 1 px: if they are in parts of the "
-                "picture, its graph must multiply them by its width and height"
-            )
-            warnings.warn(text, PartsOfPicture, stacklevel=2)
         return Detections(boxes, scores, labels.astype(np.int64))
 
     def _others(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
         """Maps (K, H', W') and numbers (K,) of each picture; [] if there are other outputs."""
         found = {}
         for name, values in outputs.items():
-            if values.ndim == 3 and values.shape[1:] == self.size:
-                values = values[:, None]
-            elif values.ndim == 4 and self._is_last:
+            if values.ndim == 4 and self._is_last:
                 values = np.moveaxis(values, -1, 1)
-            if values.ndim not in (1, 2, 4) or len(values) != count:
+            # Tables of numbers that are no ids have the size of a fraction by chance.
+            is_map = values.shape[1:] == self.size or values.dtype.kind in "biu"
+            if values.ndim == 3 and is_map and self._scale_of(values.shape):
+                values = values[:, None]
+            elif values.ndim == 4 and values.shape[2:] == (1, 1) != self.size:
+                values = values[:, :, 0, 0]
+            is_known = self._scale_of(values.shape) if values.ndim == 4 else values.ndim < 3
+            if not (values.ndim and is_known and len(values) == count):
                 return []
             self._check_numbers(values)
             found[name] = values
         return [{name: values[k] for name, values in found.items()} for k in range(count)]
+
+    def _scale_of(self, shape: Sequence[int]) -> int | None:
+        """The pixels of the picture along each side of a pixel of a map, (…, H', W')."""
+        scales = {of // max(to, 1) for of, to in zip(self.size, shape[-2:], strict=True)}
+        scale = scales.pop()
+        whole = tuple(scale * side for side in shape[-2:]) == self.size
+        return scale if whole and not scales else None
+
+    def _check_heads(self) -> None:
+        """ValueError for maps that are the heads of a detector."""
+        scales: dict[int, dict[str, int | None]] = {}
+        for name, shape in self.shapes.items():
+            if len(shape) == 3 and shape[0] > 1:
+                scales.setdefault(shape[0], {})[name] = self._scale_of(shape)
+        for of_names in scales.values():
+            if len(set(of_names.values())) > 1 and 1 not in of_names.values():
+                given = ", ".join(f"{name} {_text(self.shapes[name])}" for name in of_names)
+                raise ValueError(
+                    f"{self.path} has the same channels at several scales, {given}, as the heads "
+                    f"of a detector, which are no maps of pixels; {_KNOWN}"
+                )
 
     def _check_numbers(self, *outputs: np.ndarray) -> None:
         if not all(np.isfinite(values).all() for values in outputs):

@@ -155,12 +155,13 @@ class Program:
         reads: Sequence[int],
         writes: Sequence[int],
         to: int = 0,
+        begin: int = 0,
     ) -> Slot:
-        """Copies an array of up to five axes between places with these strides; `to` is where
-        writing begins."""
+        """Copies an array of up to five axes between places with these strides; `begin` and `to`
+        are where reading and writing begin."""
         axes = zip(sizes, reads, writes, strict=True)
         padded = [(1, 0, 0)] * (5 - len(sizes)) + list(axes)
-        self._step(COPY, x, out, 0, to, *chain.from_iterable(zip(*padded, strict=True)))
+        self._step(COPY, x, out, begin, to, *chain.from_iterable(zip(*padded, strict=True)))
         return out
 
     def permuted(self, x: Slot, sizes: Sequence[int], order: Sequence[int], *shape: int) -> Slot:
@@ -184,6 +185,16 @@ class Program:
             self.copy(x, out, (x.rows, own), (own, 1), (width, 1), begin)
             begin += own
         return out
+
+    def around(self, x: Slot) -> Slot:
+        """A map with its last column before its first, and its first after its last."""
+        rows, columns, channels = x.shape
+        out = self.buffer(rows, columns + 2, channels)
+        reads, writes = (columns * channels, 1), ((columns + 2) * channels, 1)
+        last = (columns - 1) * channels
+        self.copy(x, out, (rows, columns * channels), reads, writes, channels)
+        self.copy(x, out, (rows, channels), reads, writes, 0, begin=last)
+        return self.copy(x, out, (rows, channels), reads, writes, last + 2 * channels)
 
     def channels_last(self, *images: Slot) -> Slot:
         """Images (C, H, W) of the same size, joined to one map (H, W, C)."""

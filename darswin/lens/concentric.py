@@ -15,7 +15,6 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_rays
 from darswin.lens.spacing import Spacing, span, to_spacing, to_theta
-from darswin.ops.checks import tensor_there
 
 
 def square_to_disc(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,15 +104,3 @@ def points_at(
     radius = ((value - first) / (last - first)).clamp(max=1)
     points = disc_to_square(radius, direction)
     return torch.where(seen[..., None], points, OUTSIDE)
-
-
-def square_pixels(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """Points (B or 1, H, W, 2) of a square → pixels of its map of (H', W').
-
-    The outermost pixels extend to the square's edge. `OUTSIDE` stays.
-    """
-    height, width = size
-    sides = tensor_there((width, height), points)
-    pixels = ((points + 1) * sides - 1) / 2
-    inside = torch.minimum(pixels.clamp(min=0), sides - 1)
-    return torch.where(points == OUTSIDE, OUTSIDE, inside)

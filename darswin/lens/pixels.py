@@ -155,14 +155,16 @@ def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int])
 
 def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     """Samples images (B, C, H, W) at pixels (B or 1, H', W', 2), bilinearly and with 0 outside:
-    (B, C, H', W') on the images' device and in their dtype."""
+    (B, C, H', W') on the images' device and in their dtype. Of integers it takes the nearest."""
     height, width = images.shape[2:]
-    exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
+    mode = "bilinear" if images.is_floating_point() else "nearest"
+    least = torch.float32 if mode == "bilinear" else torch.float64  # which holds large integers
+    exact = torch.promote_types(images.dtype, least)  # bfloat16 has no half pixels
     there = pixels.to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
     points = (2 * there + 1) / tensor_there((width, height), there) - 1
     points = points.expand(images.shape[0], -1, -1, -1)
-    view = F.grid_sample(images.to(exact), points, padding_mode="zeros", align_corners=False)
+    view = F.grid_sample(images.to(exact), points, mode, padding_mode="zeros", align_corners=False)
     return view.to(images.dtype)
 
 

@@ -135,4 +135,4 @@ class ConvUnet(PixelModel):
             x = F.interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
             x = block(torch.cat((x, skip), 1))
         logits = self.head.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        return self.head.finish(self.view.back(logits, prepared))
+        return self.head.finish(self.view.back(logits, prepared), prepared.shown)

@@ -58,8 +58,8 @@ class PixelHead(nn.Module):
         x = x + F.gelu(self.mix(x))
         return self.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
-    def finish(self, logits: Tensor) -> Tensor:
-        """Logits (B, K, H, W) → the model's result."""
+    def finish(self, logits: Tensor, shown: Tensor | None = None) -> Tensor:
+        """Logits (B, K, H, W) → the model's result; shown: see `Prepared`."""
         return logits
 
     def extra_repr(self) -> str:
@@ -67,7 +67,8 @@ class PixelHead(nn.Module):
 
 
 class DistanceHead(PixelHead):
-    """Distances in m, `typical_distance` · e^x. x is bounded, so they are positive and finite."""
+    """Distances in m, `typical_distance` · e^x. x is bounded, so they are positive and finite; 0
+    is unknown."""
 
     def __init__(self, dim: int, in_chans: int, skip_width: int, typical_distance: float):
         super().__init__(dim, 1, in_chans, skip_width)
@@ -75,11 +76,12 @@ class DistanceHead(PixelHead):
             raise ValueError(f"typical_distance must be above 0 m, got {typical_distance}")
         self.typical_distance = float(typical_distance)
 
-    def finish(self, logits: Tensor) -> Tensor:
-        """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64."""
+    def finish(self, logits: Tensor, shown: Tensor | None = None) -> Tensor:
+        """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64; 0 unless shown."""
         x = logits.to(torch.promote_types(logits.dtype, torch.float32))
         x = LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT)
-        return self.typical_distance * torch.exp(x)
+        metres = self.typical_distance * torch.exp(x)
+        return metres if shown is None else torch.where(shown.to(x.device)[:, None], metres, 0.0)
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, typical_distance={self.typical_distance}"

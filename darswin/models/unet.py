@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
@@ -19,6 +18,7 @@ from darswin.models.swin import Swin
 from darswin.utils.tasks import PixelTask
 from darswin.views import Prepared
 from darswin.views.base import Pair
+from darswin.views.pixels import resized
 
 EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
 
@@ -96,8 +96,9 @@ class Unet(PixelModel):
     """A class or a distance for every pixel: an encoder and a mirrored decoder.
 
     The result has the height and the width of the images. For "segmentation" it is logits (B,
-    num_classes, H, W); for "distance" it is metres along the ray, (B, 1, H, W), and positive. At
-    pixels that no ray of the lens reaches, the result has no meaning.
+    num_classes, H, W); for "distance" it is metres along the ray, (B, 1, H, W). Where the view
+    shows nothing, distances are 0, for unknown, and logits have no meaning: there,
+    `model.prepare(lens, size).shown` is False.
 
     The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
     projected to `skip_width` channels and resampled to the pixels. A few convolutions, which also
@@ -211,25 +212,19 @@ class Unet(PixelModel):
             maps = self._with_places(maps, prepared.tokens)
         carried = head.carried(decoder(maps, prepared.tables[len(maps) :]))
         if self.view.in_pixels:
-            carried = _resized(carried.permute(0, 3, 1, 2), x.shape[2:])
+            carried = resized(carried.permute(0, 3, 1, 2), x.shape[2:])
             logits = head.refine(carried, with_rays(x, prepared.rays))
-            return head.finish(self.view.back(logits, prepared))
+            return head.finish(self.view.back(logits, prepared), prepared.shown)
         carried = self.view.back(carried, prepared)
         if images is not None:
             images = with_rays(self.view.floating(images, self.dtype), prepared.rays)
-        return head.finish(head.refine(carried, images))
+        return head.finish(head.refine(carried, images), prepared.shown)
 
     def _with_places(self, maps: Sequence[Tensor], tokens: Sequence[Tensor]) -> list[Tensor]:
         """The encoder's maps, plus a linear function of the positions of their tokens."""
         weight = next(self.places.parameters())
         steps = zip(maps, self.places, tokens, strict=True)
         return [x + layer(place.to(weight)).to(x.dtype) for x, layer, place in steps]
-
-
-def _resized(maps: Tensor, size: Sequence[int]) -> Tensor:
-    if maps.shape[2:] == size:
-        return maps
-    return F.interpolate(maps, size, mode="bilinear", align_corners=False)
 
 
 @register_model("darswin_unet_a", kind=Unet, variant="A", presets=_POLAR)

@@ -175,7 +175,7 @@ def polar_to_image(
     """See `darswin.ops.polar_to_image`. It computes the positions itself and ignores the plan."""
     batch, rings, sectors, channels = x.shape
     if points is None and center is not None:
-        points = _on_polar_plane(size, center, affine)
+        points = on_polar_plane(size, center, affine)
     assert points is not None
     across, down = points.unbind(-1)  # (N, H, W)
     known = across.isfinite() & down.isfinite()
@@ -241,7 +241,7 @@ def ranks(rising: Tensor, values: Tensor) -> Tensor:
     return count
 
 
-def _on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:
+def on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:
     """(N, H, W, 2): each pixel's position relative to the centre, with the matrix inverted."""
     height, width = size
     y, x = (torch.arange(n, dtype=center.dtype, device=center.device) for n in (height, width))

@@ -24,7 +24,7 @@ from darswin.data.warping import CutOff
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals
-from darswin.utils.parameters import check, naming
+from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit
 
 __all__ = ["RunData", "WideAngleData"]
@@ -111,6 +111,7 @@ class RunData(LightningDataModule):
         super().__init__()
         check("batch_size", batch_size, batch_size >= 1, "at least 1")
         check("workers", workers, workers >= 0, "at least 0")
+        check_statistics(mean, std)
         self.path, self._lens = path, lens
         self._camera, self._coefficients = camera, coefficients
         self._size, self._channels, self._mean, self._std = size, channels, mean, std

@@ -22,12 +22,13 @@ _EARLY = 100  # batches after which a training without any target stops
 
 
 class Measured(nn.Module):
-    """The metrics of a data set: sums over the pixels of each zone, the mean loss, and the number
-    of images with a known pixel."""
+    """The metrics of a data set: sums over the pixels of each zone, the mean loss, the number of
+    images with a known pixel, and the number of known pixels, also of those without an answer."""
 
     def __init__(self, sums: PixelSums):
         super().__init__()
         self.sums, self.loss, self.images = sums, MeanMetric(), SumMetric()
+        self.asked = SumMetric()
 
 
 class PixelModule(TaskModule):
@@ -51,8 +52,9 @@ class PixelModule(TaskModule):
     Attributes:
         results: after a test, a row for each test set: `data`, its name; `n`, the number of images
             with a known pixel; the scores; the scores weighted by solid angle, whose names end in
-            `_sr`; `pixels`, the number of known pixels; `per_class` and `per_zone`. A score
-            without any known pixel is None.
+            `_sr`; `pixels`, the number of known pixels with an answer; `unanswered`, the share of
+            known pixels that the model's view does not show, which the scores leave out;
+            `per_class` and `per_zone`. A score without any known pixel is None.
         samples: some of the tested images, (H, W, C) uint8, with their targets and predictions,
             (H, W), ids or m.
     """
@@ -117,6 +119,15 @@ class PixelModule(TaskModule):
 
     # -- training -----------------------------------------------------------------------------
 
+    def _run(self, images: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+        """The model's output (B, K, H, W), and a mask (B or 1, H, W) of what its view shows: there
+        alone it has an answer."""
+        prepared = self.net.prepare(lens, (images.shape[2], images.shape[3]))
+        predicted = self.net.run(images, prepared).float()
+        if prepared.shown is None:
+            return predicted, predicted.new_ones(1, 1, 1, dtype=torch.bool)
+        return predicted, prepared.shown.to(predicted.device)
+
     def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
         images, lens, target = batch
         weights = None
@@ -124,7 +135,8 @@ class PixelModule(TaskModule):
             area = solid_angles(lens.merged(), (images.shape[2], images.shape[3]))
             weights = (area / area.mean((1, 2), keepdim=True)).to(images.device)
             weights = weights.expand(len(images), -1, -1)
-        return self._criterion(self.net(images, lens).float(), target, weights)
+        predicted, shown = self._run(images, lens)
+        return self._criterion(predicted, torch.where(shown, target, self.nothing), weights)
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Collects the ids in the targets of the first epoch. They are checked after the epoch, or
@@ -161,13 +173,16 @@ class PixelModule(TaskModule):
     # -- evaluation ---------------------------------------------------------------------------
 
     def _predict(self, batch: Batch, measured: Measured) -> tuple[Tensor, Tensor]:
-        """The answer for each pixel and a mask of the known pixels; adds the loss of these."""
+        """The answer for each pixel and a mask of the known pixels that have one; adds the loss of
+        these."""
         images, lens, target = batch
-        predicted = self.net(images, lens.merged()).float()
+        measured.asked.update(self._known(target).sum())
+        predicted, shown = self._run(images, lens.merged())
+        target = torch.where(shown, target, self.nothing)
         known = self._known(target)
         if known.any():
             measured.loss.update(self._criterion(predicted, target, None), weight=known.sum())
-        return self._answer(predicted), known
+        return torch.where(shown, self._answer(predicted), self.nothing), known
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Adds a batch to the loss and scores of the validation."""
@@ -231,7 +246,9 @@ class PixelModule(TaskModule):
             per_class = self._per_class(counts.sum(0), areas.sum(0))
             nested = dict(per_class=per_class, per_zone=per_zone)
             row = {"data": name, "n": int(measured.images.compute())}
-            self.results.append(row | scores | {"loss": loss} | nested)
+            asked = measured.asked.compute().item()
+            unanswered = 1 - scores["pixels"] / asked if asked else None
+            self.results.append(row | scores | dict(unanswered=unanswered, loss=loss) | nested)
 
     def results_figure(self) -> Figure | None:
         """A figure of the samples: images, targets and predictions."""

@@ -29,6 +29,7 @@ _IN_PERCENT = (
     "delta1",
     "delta2",
     "delta3",
+    "unanswered",
 )
 # Scores that only the files have.
 _NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3", "to_deg", "top1_high")
@@ -104,6 +105,8 @@ def _csv(rows: Table) -> str:
 def _text(rows: Table) -> str:
     """A readable table: columns of words are flush left, and shares are in percent."""
     hidden = {*_NOT_SHOWN, *(f"{key}{BY_AREA}" for key in _NOT_SHOWN_BY_AREA)}
+    if not any(row.get("unanswered") for row in rows):
+        hidden.add("unanswered")
     columns = []
     for key in rows[0]:
         if key not in hidden:

@@ -1,6 +1,7 @@
 """Errors that carry the names of their parameters, so that a command can show them as its flags."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 Said = TypeVar("Said", bound=Exception)
@@ -19,6 +20,22 @@ def check(name: str, value: object, ok: bool, allowed: str) -> None:
     """Raises ValueError, which names the parameter, what it must be, and its value, unless `ok`."""
     if not ok:
         raise naming(ValueError(f"`{name}` must be {allowed}, got {value!s:.200}"), name)
+
+
+def check_statistics(mean: Sequence[float] | None, std: Sequence[float] | None) -> None:
+    """ValueError unless a mean and a std are parts of 255, as in (pixel/255 - mean) / std. Other
+    tools write them for pixels from 0 to 255."""
+    for name, values in (("mean", mean or ()), ("std", std or ())):
+        given = ",".join(f"{value:g}" for value in values)
+        check(name, given, all(map(math.isfinite, values)), "finite")
+        most = max(map(abs, values), default=0.0)
+        hint = "in parts of 255, at most 1"
+        if 1 < most <= 255:
+            parts = ",".join(f"{value / 255:.4g}" for value in values)
+            hint += f" (of pixels from 0 to 255, this is {parts})"
+        check(name, given, most <= 1, hint)
+        if name == "std":
+            check(name, given, all(value > 0 for value in values), "above 0")
 
 
 def with_flags(said: Exception, flag_of: Callable[[str], str] = "--{}".format) -> str:

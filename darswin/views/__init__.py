@@ -2,7 +2,6 @@
 
 from darswin.views.base import (
     PixelGrid,
-    PixelView,
     PolarGrid,
     Prepared,
     View,
@@ -13,6 +12,7 @@ from darswin.views.equirectangular import EquirectangularView
 from darswin.views.mercator import MercatorView
 from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
+from darswin.views.pixels import PixelView
 from darswin.views.plain import PlainView
 from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.registry import list_views, make_view, register_view

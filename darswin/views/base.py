@@ -1,25 +1,21 @@
 """The seam between lenses and networks: what a view is."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from darswin.lens import Lens
-from darswin.lens.pixels import OUTSIDE, ray_channels, sample_at
 from darswin.ops.checks import (
     FRAME_CHANNELS,
     channels_first,
     check_has_batch,
-    check_pair,
     per_channel,
     readable,
-    tensor_there,
 )
 from darswin.ops.reference import normalized
-from darswin.utils.arrays import as_tensor
 
 Pair = tuple[int, int]
 PerChannel = float | Sequence[float]
@@ -71,6 +67,10 @@ class Prepared(NamedTuple):
       the pixels of the view, or of the images if the view has no pixels; 0 where no ray lands.
     - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
     - `tables`: for each stage of a network, the position biases of its blocks; a view has none.
+    - `shown`: (N or 1, H, W), True for the pixels of the images that the view shows: elsewhere a
+      network has no answer. None means all pixels, or that the way back was not asked for.
+    - `around`: (N or 1,), True if the view goes all around, so that its first column follows its
+      last. None means that none does.
     """
 
     size: Pair
@@ -79,6 +79,8 @@ class Prepared(NamedTuple):
     rays: Tensor | None = None
     tokens: Sequence[Tensor] = ()
     tables: Sequence[Sequence[Tensor]] = ()
+    shown: Tensor | None = None
+    around: Tensor | None = None
 
 
 class View(nn.Module):
@@ -151,10 +153,11 @@ class View(nn.Module):
         raise NotImplementedError
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        """A map of the network → the pixels of the images, (B, K, H, W); 0 where no ray lands.
+        """A map of the network → the pixels of the images, (B, K, H, W); 0 unless `Prepared.shown`.
 
         Args:
-            maps: (B, K, H', W') if the view is `in_pixels`, else (B, R, A, K).
+            maps: (B, K, H', W') if the view is `in_pixels`, else (B, R, A, K). Values between
+                pixels are interpolated; maps of integers, such as ids, give the nearest.
         """
         raise NotImplementedError
 
@@ -195,147 +198,6 @@ class View(nn.Module):
         mean = per_channel("mean", self.mean, images.shape[1])
         std = per_channel("std", self.std, images.shape[1])
         return normalized(images, mean, std, exact).to(dtype)
-
-
-class PixelView(View):
-    """A view whose pixels are pixels of the images. A subclass says which: three maps of points.
-
-    Args:
-        size: (H', W') of the view; None for the size of the images, if the view ignores its lens.
-    """
-
-    def __init__(
-        self, size: Pair | None, *, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0
-    ):
-        super().__init__(mean, std)
-        if size is not None or self.uses_lens:
-            size = check_pair("size", size, 1)
-        self.size = size
-
-    def image_points(self, lens: Any, size: Pair) -> Tensor | None:
-        """The points of images of (H, W) that the pixels of the view show, (N, H', W', 2) px."""
-        raise NotImplementedError
-
-    def view_points(self, lens: Any, size: Pair) -> Tensor | None:
-        """The points of the view that the pixels of images of (H, W) show, (N, H, W, 2) px."""
-        raise NotImplementedError
-
-    def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
-        """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
-        raise NotImplementedError
-
-    def reads_of(self, size: Pair) -> int:
-        """The points along each side of a pixel at which images of (H, W) are read."""
-        return 1
-
-    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
-        """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN
-        where the view shows nothing. size: (H, W) of the images of N lenses."""
-        raise NotImplementedError
-
-    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
-        """The inverse of `to_rays`: pixels (N, ..., 2) of the view, which may be outside of it."""
-        raise NotImplementedError
-
-    def to_image(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
-        """Pixels (..., 2) of the view → pixels (..., 2) of images of (H, W), exactly.
-
-        Args:
-            points: x and y, a NumPy array or a tensor; computed in float64.
-            lens: one lens. size: (H, W) of its images.
-            of_tile: `tile=k`, the number of the tile, if the view has tiles.
-
-        Returns:
-            Points as given, which may be outside of the image; NaN where no ray lands.
-        """
-        return _exactly(points, lens, size, lambda pixels, exact: exact.project_points(
-            self.to_rays(pixels, exact, size, **of_tile), size))  # fmt: skip
-
-    def to_view(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
-        """Pixels (..., 2) of images of (H, W) → pixels (..., 2) of the view: the inverse of
-        `to_image`, with its arguments."""
-        return _exactly(points, lens, size, lambda pixels, exact: self.to_points(
-            exact.unproject_points(pixels, size), exact, size, **of_tile))  # fmt: skip
-
-    def prepare(
-        self,
-        lens: Lens | None,
-        size: Pair,
-        *,
-        back: bool | Pair = True,
-        rays: bool = True,
-        maps: Sequence[Pair] = (),
-    ) -> Prepared:
-        if self.uses_lens or rays:
-            check_lens(lens, size)
-        points = self.image_points(lens, size)
-        return Prepared(
-            size,
-            points,
-            self.view_points(lens, size) if back else None,
-            ray_channels(*self.pixel_rays(lens, size)) if rays else None,
-            [_centers(of_map, None if points is None else points.device) for of_map in maps],
-        )
-
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
-        images = self.floating(images, dtype)
-        if prepared.points is None:
-            return images
-        assert isinstance(prepared.points, Tensor)
-        check_count(prepared.points.shape[0], images)
-        return sample_at(images, prepared.points)
-
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        return sample_at(maps, self.back_points(prepared, (maps.shape[2], maps.shape[3])))
-
-    def back_points(self, prepared: Prepared, size: Pair) -> Tensor:
-        """The pixels of a map of this size that `back` brings to the pixels of the images,
-        (N, H, W, 2)."""
-        assert isinstance(prepared.back, Tensor) and self.size is not None
-        if size == self.size:
-            return prepared.back
-        return torch.where(prepared.back == OUTSIDE, OUTSIDE, self.scaled(prepared.back, size))
-
-    def scaled(self, points: Tensor, size: Pair) -> Tensor:
-        """Points of the view in a map of another size. Its outermost pixels extend to the edges."""
-        assert self.size is not None
-        there, scale = (
-            tensor_there(sides[::-1], points)
-            for sides in (size, [of / to for of, to in zip(size, self.size, strict=True)])
-        )
-        return torch.minimum(((points + 0.5) * scale - 0.5).clamp(min=0), there - 1)
-
-    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
-        seen = check_seen_images(seen, self.size or prepared.size, channels)
-        if isinstance(prepared.points, Tensor):
-            check_count(prepared.points.shape[0], seen)
-        return seen
-
-    def extra_repr(self) -> str:
-        return f"size={self.size}"
-
-
-def _exactly(
-    points: Points, lens: Lens, size: Pair, move: Callable[[Tensor, Lens], Tensor]
-) -> Points:
-    """Moves points (..., 2) through one lens of images of (H, W) in float64."""
-    if len(check_lens(lens, size)) != 1:
-        raise ValueError(f"points move through one lens, got {len(lens)}")
-    if (shape := tuple(np.shape(points)))[-1:] != (2,):
-        raise ValueError(f"points must have shape (..., 2), got {shape}")
-    if not isinstance(points, Tensor):
-        places = np.asarray(points)
-        exact = as_tensor(places, torch.float64)
-        moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
-        return moved.numpy().astype(np.result_type(places, np.float32), copy=False)
-    moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]
-    return moved.to(torch.promote_types(points.dtype, torch.float32))
-
-
-def _centers(size: Pair, device: torch.device | None) -> Tensor:
-    """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
-    y, x = ((2 * torch.arange(side, device=device) + 1) / side - 1 for side in size)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 
 
 def check_images(

@@ -15,7 +15,8 @@ from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
 from darswin.utils.angles import check_turn, degrees_hint
 from darswin.utils.arrays import as_tensor
-from darswin.views.base import Pair, PerChannel, PixelView, Prepared, check_lens
+from darswin.views.base import Pair, PerChannel, Prepared, check_lens
+from darswin.views.pixels import PixelView
 
 Vector = Sequence[float] | Tensor
 
@@ -25,6 +26,7 @@ _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sp
 _STEPS = 361  # points at which the end of what a lens sees is looked for
 _BISECTIONS = 12
 _LEAST_STEP = 1e-9  # of a view whose middle the picture does not show
+_SEAM = 1e-3  # px that a view may lack and still goes all around
 _APART = 1.5  # pixels of the image between points at which it is read
 _USUAL_READS = 4  # at most, unless `reads` says more
 MOST_READS = 16  # that a plan of `darswin.frames` can hold
@@ -149,6 +151,12 @@ class RayView(PixelView):
         grid = pixel_grid(size, lens.theta_max)
         rays = lens.unproject_points(grid, size)
         return as_map(self._points(rays, self._shows(rays), lens, size))
+
+    def goes_around(self, lens: Lens, size: Pair) -> Tensor | None:
+        if not self.upright:
+            return None
+        around = self._layout(lens, size)[0][:, 0] * (self.size[1] + _SEAM) >= 2 * math.pi
+        return around if not readable(around) or around.any() else None
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         rays = self._rays(lens, size)

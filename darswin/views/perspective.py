@@ -6,7 +6,8 @@ from torch import Tensor
 
 from darswin.lens import Lens, pixels
 from darswin.utils.angles import degrees_hint
-from darswin.views.base import Pair, PerChannel, PixelView
+from darswin.views.base import Pair, PerChannel
+from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 
 

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens, pixels
-from darswin.views.base import Pair, PixelView, Prepared
+from darswin.views.base import Pair, Prepared
+from darswin.views.pixels import PixelView, resized
 from darswin.views.registry import register_view
 
 
@@ -37,6 +37,4 @@ class PlainView(PixelView):
         return lens.project_points(rays, size)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        if maps.shape[2:] == prepared.size:
-            return maps
-        return F.interpolate(maps, prepared.size, mode="bilinear", align_corners=False)
+        return resized(maps, prepared.size)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
@@ -37,6 +36,7 @@ from darswin.views.base import (
     check_lens,
     check_seen_images,
 )
+from darswin.views.polar_back import nearest, places_of, resized_around, shown_by
 from darswin.views.registry import register_view
 
 Layout = Literal["tokens", "image"]
@@ -129,12 +129,14 @@ class PolarView(View):
         maps: Sequence[Pair] = (),
     ) -> Prepared:
         lens = check_lens(lens, size)
+        grid = self.pixel_grid(lens, size, self._split(back)) if back else None
         return Prepared(
             size,
             self.grid(lens, size),
-            self.pixel_grid(lens, size, self._split(back)) if back else None,
+            grid,
             self._ray_channels(lens, size) if rays else None,
             [self.token_rays(lens, of_map) for of_map in maps],
+            shown=None if grid is None else shown_by(grid, size),
         )
 
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -167,10 +169,10 @@ class PolarView(View):
         assert isinstance(prepared.back, PixelGrid)
         *lens, plan = prepared.back
         if self.in_pixels:
-            rings, sectors = self.map_size
-            if maps.shape[2:] != (rings, sectors):
-                maps = F.interpolate(maps, (rings, sectors), mode="bilinear", align_corners=False)
-            maps = maps.permute(0, 2, 3, 1)
+            maps = resized_around(maps, self.map_size).permute(0, 2, 3, 1)
+        if not maps.is_floating_point():
+            places = places_of(maps).permute(*((0, 3, 1, 2) if self.in_pixels else (0, 1, 2, 3)))
+            return nearest(maps, self.back(places, prepared), prepared)
         dtype = torch.float64 if maps.dtype == torch.float64 else torch.float32
         radii, r_max, center, affine, points = (
             None if tensor is None else tensor.to(maps.device, dtype) for tensor in lens

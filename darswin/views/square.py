@@ -7,7 +7,6 @@ from darswin.lens import Lens
 from darswin.lens.concentric import (
     points_at,
     rays_at,
-    square_pixels,
     square_points,
     square_rays,
     square_view,
@@ -15,7 +14,8 @@ from darswin.lens.concentric import (
 from darswin.lens.pixels import OUTSIDE
 from darswin.lens.solve import length_of, vector_of
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
-from darswin.views.base import Pair, PerChannel, PixelView, Prepared
+from darswin.views.base import Pair, PerChannel
+from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 
 
@@ -63,8 +63,9 @@ class SquareView(PixelView):
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        """In [-1, 1] from edge to edge, and not in px."""
-        return square_points(lens, size, self.spacing, self.theta_max)
+        points = square_points(lens, size, self.spacing, self.theta_max)
+        pixels = ((points + 1) * self.size[0] - 1) / 2
+        return torch.where(points == OUTSIDE, OUTSIDE, pixels)
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         return square_rays(lens, self.size[0], self.spacing, self.theta_max)
@@ -83,10 +84,6 @@ class SquareView(PixelView):
         square = points_at(lens, theta, direction, self.spacing, self.theta_max)
         points = ((square + 1) * self.size[0] - 1) / 2
         return torch.where(square == OUTSIDE, torch.nan, points)
-
-    def back_points(self, prepared: Prepared, size: Pair) -> Tensor:
-        assert isinstance(prepared.back, Tensor)
-        return square_pixels(prepared.back, size)
 
     def extra_repr(self) -> str:
         edge = "" if self.theta_max is None else f", theta_max={self.theta_max:g}"

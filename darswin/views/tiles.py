@@ -14,7 +14,6 @@ from darswin.utils.angles import degrees_hint
 from darswin.views.base import (
     Pair,
     PerChannel,
-    PixelView,
     Prepared,
     check_count,
     check_seen_images,
@@ -27,6 +26,7 @@ from darswin.views.directions import (
     frame_of,
     unit_vector,
 )
+from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 from darswin.views.stereographic import StereographicView
 
@@ -119,8 +119,12 @@ class TilesView(PixelView):
         points = torch.cat([tile.read_points(lens, size) for tile in self.tiles], 1)
         return check_sees(points, self, lens, size)
 
+    def shown_points(self, lens: Lens, size: Pair) -> Tensor:
+        return self.view_points(lens, size)
+
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        """The points of the tiles below each other that the pixels of the images show."""
+        """The points of the tiles below each other that the pixels of the images show, and
+        `OUTSIDE` beyond the tiles."""
         height, width = self.size
         best = torch.full((1,), -0.5)
         found = torch.full((1, 2), OUTSIDE)
@@ -130,7 +134,9 @@ class TilesView(PixelView):
             margin = torch.stack((x, width - 1 - x, y, height - 1 - y)).amin(0)
             inner = margin > best
             best = torch.where(inner, margin, best)
-            found = torch.where(inner[..., None], torch.stack((x, y + k * height), -1), found)
+            # A point just above the lower edge must not round to the next tile.
+            point = torch.stack((x, y.clamp(max=height - 0.51) + k * height), -1)
+            found = torch.where(inner[..., None], point, found)
         return found
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
@@ -149,7 +155,8 @@ class TilesView(PixelView):
         rows = prepared.back[..., 1]
         tile = torch.floor((rows + 0.5) / self.size[0])
         inner = torch.stack((prepared.back[..., 0], rows - tile * self.size[0]), -1)
-        x, y = self.tiles[0].scaled(inner, (maps.shape[2], maps.shape[3])).unbind(-1)
+        size, one = (maps.shape[2], maps.shape[3]), self.tiles[0]
+        x, y = one.within(one.scaled(inner, size), size).unbind(-1)
         points = torch.stack((x, y + tile * maps.shape[2]), -1)
         stacked = maps.unflatten(0, (-1, self.count)).transpose(1, 2).flatten(2, 3)
         return sample_at(stacked, torch.where(prepared.back == OUTSIDE, OUTSIDE, points))
