@@ -44,3 +44,15 @@ def threads():
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def other_rounding():
+    """With DARSWIN_TEST_ROUNDING, torch rounds as no CPU does: see rounding.py."""
+    if "DARSWIN_TEST_ROUNDING" not in os.environ:
+        yield
+        return
+    from rounding import Rounded
+
+    with Rounded():
+        yield
