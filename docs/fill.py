@@ -79,13 +79,10 @@ def missed_line(timings: Sequence[Timing]) -> str:
         chosen = [t for t in with_target if t.subject.partition(",")[0] == operator]
         counts.append(f"{sum(t.missed for t in chosen)} of {len(chosen)} for `{operator}`")
     lost = [t for t in with_target if t.ratio < 1 and not t.name.startswith(OURS)]
-    return (
-        f"On this CPU the operators miss {', '.join(counts[:-1])} and {counts[-1]}.\n"
-        + (
-            f"A peer is faster than the operator in {len(lost)} of these rows."
-            if lost
-            else "They are faster than the peer in every row."
-        )
+    return f"On this CPU the operators miss {', '.join(counts[:-1])} and {counts[-1]}.\n" + (
+        f"A peer is faster than the operator in {len(lost)} of these rows."
+        if lost
+        else "They are faster than the peer in every row."
     )
 
 
