@@ -51,27 +51,21 @@ def scenes(tmp_path_factory):
         ("--checkpoint_steps 0", "--checkpoint_steps must be at least 1, got 0"),
         ("--devices many", "error: --devices: "),
         # The option or the preset that was probably meant.
-        (
-            "--data.pth x",
-            "error: unrecognized arguments: --data.pth x; the nearest option is --data.p",
-        ),
+        ("--data.pth x",
+         "error: unrecognized arguments: --data.pth x; the nearest option is --data.p"),
         ("--data.lmit 3 --batch_size 2", "the nearest option is --data.limit, --data.batch_size; "),
         ("--epochs 3", "the nearest option is --trainer.max_epochs; `darswin fit --help`"),
         ("--data.xi 0.3", "the nearest option is --xi; "),
         ("--zzzzzz 3", "unrecognized arguments: --zzzzzz 3; `darswin fit --help` lists the opt"),
         ("--model darswin_a_small", "darswin_a_small is none; type --model.name darswin_a_small; "),
-        (
-            "--model=darswin_a_small",
-            "darswin: --model takes a file of options, and darswin_a_small is",
-        ),
+        ("--model=darswin_a_small",
+         "darswin: --model takes a file of options, and darswin_a_small is"),
         ("--data photos", "type --data.path photos; `darswin fit --help` lists the options"),
         ("--trainer 3", "--trainer takes a file of options, and 3 is none; `darswin fit"),
-        (
-            "--config minute",
-            "did you mean minutes? The presets are few, iccv2023, iccv2023_paper, min",
-        ),
+        ("--config minute",
+         "did you mean minutes? The presets are few, iccv2023, iccv2023_paper, min"),
     ],
-)
+)  # fmt: skip
 def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message):
     given = ["fit", "--run", tmp_path / "r", *DIGITS, "--data.limit", "96", *options.split()]
     said = error(capsys, *(word.replace(":", ": ") if "{" in str(word) else word for word in given))
@@ -113,20 +107,14 @@ def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
         (["--config", "c.yaml"], "no folder elsewhere"),
         (["--config", "none"], "none is neither a file nor a preset"),
         (["--task", "depth"], "--task must be one of classification, segmentation, distance, got"),
-        *(
-            (
-                ["--config", preset, "--task", task],
-                f"{preset} is for --task {fits}, not for {task},",
-            )
-            for preset, task, fits in (
-                ("two_cores", "segmentation", "classification"),
-                ("few", "distance", "classification"),
-                ("scenes_minutes", "classification", "segmentation or distance"),
-            )
-        ),
+        *((["--config", preset, "--task", task], f"{preset} is for --task {fits}, not for {task},")
+          for preset, task, fits in (
+            ("two_cores", "segmentation", "classification"),
+            ("few", "distance", "classification"),
+            ("scenes_minutes", "classification", "segmentation or distance"))),
         (["--config", "two_cores", "--task", "distance"], "distance, which has scenes_minutes"),
     ],
-)
+)  # fmt: skip
 def test_errors_before_the_slow_imports(capsys, tmp_path, monkeypatch, options, message):
     monkeypatch.setattr("darswin.cli.main.resolve_name", None)  # imports the command
     monkeypatch.chdir(tmp_path)

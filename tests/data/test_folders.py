@@ -86,25 +86,17 @@ def test_class_lists_choose_and_order(tmp_path):
         (["val/a/1.jpg", "test/a/2.jpg"], None, ValueError, "may be splits or classes"),
         (["train/a/1.jpg", "more/a/1.jpg"], None, ValueError, "train may be splits .*`classes`"),
         (["train/a/1.jpg", "val/a/1.jpg", "valid/a/2.jpg"], None, ValueError, "val and .*valid"),
-        (
-            ["train/a/1.jpg", "val/a/1.jpg", "val/b/2.jpg"],
-            None,
-            ValueError,
-            r"'val' split .*\['b'\]",
-        ),
-        (
-            ["train/a/1.jpg", "test/b/1.jpg"],
-            None,
-            ValueError,
-            "'test' split .* training split lacks",
-        ),
+        (["train/a/1.jpg", "val/a/1.jpg", "val/b/2.jpg"], None, ValueError,
+         r"'val' split .*\['b'\]"),
+        (["train/a/1.jpg", "test/b/1.jpg"], None, ValueError,
+         "'test' split .* training split lacks"),
         (["a/1.jpg", "b/1.gif", "b/2.HEIC"], None, ValueError, "b holds no picture .* 1 .heic"),
         (["a/1.jpg", "c/1.txt"], "a\nc\n", FileNotFoundError, r"no pictures of the .*\['c'\]"),
         (["a/1.jpg"], "", ValueError, "names.txt must .* is empty"),
         (["a/1.jpg"], "a\nb\na\n", ValueError, r"names.txt must .* repeats \['a'\]"),
         ([], None, FileNotFoundError, "no images for the '(train|val|test)' split"),
     ],
-)
+)  # fmt: skip
 def test_what_is_refused(tmp_path, there, classes, error, message):
     touch(tmp_path, *there)
     if classes is not None:

@@ -171,9 +171,11 @@ DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
           for value in words
           for text in (instant_ngp(**{"is_fisheye": None, name: value}),
                        opencv(D=FISHEYE, **{name: value}))),
-        *((instant_ngp(is_fisheye=value, **dict.fromkeys(other, 0)), {}, dict(model=model))
+        *((instant_ngp(is_fisheye=value, **entries), {}, dict(model=model))
           for value, model in ((None, "BrownConrady"), (True, "KannalaBrandt"),
-                               (False, "BrownConrady")) for other in OTHER_CAMERAS),
+                               (False, "BrownConrady"))
+          for off in (dict.fromkeys(other, 0) for other in OTHER_CAMERAS)
+          for entries in (off, off | dict(frames=[NGP["frames"][0] | off]))),
         (instant_ngp(), {}, dict(model="KannalaBrandt", center=[803.0, 596.75],
                                  radial=[0.0182, -0.0064, 0.0027, -0.0008])),
         # Single numbers.

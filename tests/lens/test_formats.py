@@ -108,7 +108,7 @@ def test_an_unknown_model_gets_the_nearest_name(given, nearest):
     ):  # fmt: skip
         with pytest.raises(ValueError, match=start + said) as error:
             make()
-    assert all(name in str(error.value) for name in MODELS)
+        assert all(name in str(error.value) for name in MODELS)
 
 
 @pytest.mark.parametrize("path", sorted(FILES.iterdir()), ids=lambda path: path.name)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import slow_but
+from helpers import product, slow_but
 from lens_examples import ASIDE, RANDOM, double, example, f64, random_lens
 
 from darswin.lens import (
@@ -333,10 +333,12 @@ def test_an_inverse_has_no_more_steps_than_its_numbers_have_bits(dtype, steps):
     torch.testing.assert_close(found[1:], value[1:] ** (1 / 3))
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (f64, 1e-12)])
-@pytest.mark.parametrize("name", MODELS)
-def test_an_image_is_solved_as_its_rows_are(name, dtype, bound, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "precision"), product(MODELS, [(torch.float32, 1e-5), (f64, 1e-12)])
+)
+def test_an_image_is_solved_as_its_rows_are(name, precision, monkeypatch):
     """Many values begin at a table, and few do not. Bounds are relative to the largest value."""
+    dtype, bound = precision
     lenses = example(name, torch.Generator().manual_seed(7), (30, 40)).to(dtype)
     lenses = lenses.with_theta_max((0.97 * lenses.theta_limit).clamp(max=2))
     leaves = {n: t.detach().clone().requires_grad_() for n, t in lenses._tensors().items()}

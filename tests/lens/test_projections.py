@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import changed
 from lens_examples import (
     CALIBRATIONS,
     DEGREES,
@@ -218,6 +219,30 @@ def test_ocamcalib_without_an_inverse_polynomial():
     inverse = load(FILES / "ocamcalib.txt", dtype=f64)
     theta = torch.linspace(0.2, 1.5, 20, dtype=f64)
     torch.testing.assert_close(lens.project(theta), inverse.project(theta), rtol=0, atol=0.01)
+
+
+DIRECT = "-2.210000e+02 0 1.850000e-03 -3.600000e-06 1.420000e-08"
+# Fitted to the direct one by least squares, like in the toolbox, to 0.01 px.
+INVERSE = ("320.321696 164.783531 -14.771348 31.623465 8.044023 -1.452569 13.685554 -1.071077 "
+           "-9.709705 2.309502 5.628928 1.507985")  # fmt: skip
+
+
+def ocam(direct, inverse):
+    lines = [f"{len(p.split())} {p}" for p in (direct, inverse) if p]
+    return "\n".join([*lines, "240 376", "1 0 0", "480 752"])
+
+
+def test_ocamcalibs_polynomials_are_held_against_each_other():
+    assert loads(ocam(DIRECT, INVERSE), dtype=f64).project(0.0).abs().item() < 0.02
+    assert type(loads(ocam(DIRECT, ""))).__name__ == "OCam"
+    lower = changed("camodocal_scaramuzza.yaml", "SCARAMUZZA", "scaramuzza")
+    assert type(loads(lower)).__name__ == "OCamInverse"  # the spelling in LF-VIO's files
+    for old, new in (("320.3", "3203"), ("320.3", "318.3"), ("164.7", "1647"), ("-1.45", "-14.5")):
+        with pytest.raises(ValueError, match=r"must undo the direct one .* px for [\d.]+ px"):
+            loads(ocam(DIRECT, INVERSE.replace(old, new)))
+    for old, new in (("e+02", "e+021"), ("e-03", "e-031")):
+        with pytest.raises(ValueError, match=r"must undo|such that a₀"):
+            loads(ocam(DIRECT.replace(old, new), INVERSE))
 
 
 def test_scaramuzzas_axis_may_point_either_way():

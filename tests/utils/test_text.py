@@ -34,17 +34,13 @@ def test_every_encoding_gives_the_same_text(data, tmp_path):
     ("data", "reason"),
     [
         (TEXT.encode("latin-1"), ": 'utf-8' codec can't decode byte 0xe4"),
-        (
-            "dog\n".encode("utf-16-le"),
-            ", .* but has NUL characters, as UTF-16 without a byte order",
-        ),
-        (
-            "dog\n".encode("utf-16-be"),
-            ", .* but has NUL characters, as UTF-16 without a byte order",
-        ),
+        ("dog\n".encode("utf-16-le"),
+         ", .* but has NUL characters, as UTF-16 without a byte order"),
+        ("dog\n".encode("utf-16-be"),
+         ", .* but has NUL characters, as UTF-16 without a byte order"),
         ("dog\n".encode("utf-32-le"), ", .* but has NUL characters"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("read", [read_text, read_json])
 def test_other_bytes_are_an_error_that_names_the_file(data, reason, read, tmp_path):
     file = tmp_path / "classes.txt"

@@ -250,8 +250,8 @@ class AnyRatio(PixelView):
 @torch.no_grad()
 def test_a_view_of_ones_own_needs_three_methods(monkeypatch):
     monkeypatch.setitem(_VIEWS, "own", AnyRatio)
-    test_what_is_seen_comes_back_also_from_coarser_maps("own", LENSES["general"])
-    test_the_rays_of_the_views_pixels_land_where_the_view_reads("own", LENSES["two"])
+    test_what_is_seen_comes_back_also_from_coarser_maps("own", "general")
+    test_the_rays_of_the_views_pixels_land_where_the_view_reads("own", "two")
     test_frames_of_uint8_are_normalized("own")
     test_an_adapter_and_a_swin_see_every_view("own")
     test_a_unet_sees_every_view_and_brings_its_result_back("own")

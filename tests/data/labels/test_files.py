@@ -130,16 +130,14 @@ def test_the_share_that_is_visible_is_kept(tmp_path):
     [
         (dict(segmentation={"size": list(SIZE)}), "has a mask that cannot be read: a run"),
         (dict(segmentation={"size": None, "counts": [1]}), "has a mask that cannot be read"),
-        (
-            dict(segmentation={"size": list(SIZE), "counts": "zzz"}),
-            "has a mask that cannot be read",
-        ),
+        (dict(segmentation={"size": list(SIZE), "counts": "zzz"}),
+         "has a mask that cannot be read"),
         (dict(segmentation=5), "has the polygon 5, which must be finite"),
         (dict(visible=None), "has visible None, which must be a share from 0 to 1"),
         (dict(visible="yes"), "has visible 'yes'"),
         (dict(visible=55), "has visible 55"),
     ],
-)
+)  # fmt: skip
 def test_wrong_annotations_are_named(tmp_path, changes, said):
     file = write(tmp_path, **changed(0, **changes))
     with pytest.raises(ValueError, match=re.escape(f"{file}: the annotation 5 {said}")):

@@ -325,15 +325,11 @@ def with_first(list_, **entries):
         (with_segment(1, id=7 + 2**24), "two segments have the colour"),
         (lambda first, content: first["segments_info"][1].pop("id"), "a segment has no 'id'"),
         (lambda first, content: content["annotations"].append(first), "two annotations for .*000"),
-        (
-            lambda first, content: content["categories"][2].update(id=1),
-            r"train2017\.json defines the category 1 twice",
-        ),
+        (lambda first, content: content["categories"][2].update(id=1),
+         r"train2017\.json defines the category 1 twice"),
         (lambda first, content: first.pop("segments_info"), "panoptic format: it lacks 'segments"),
-        (
-            with_segment(1, category_id=[1]),
-            r"the segment 300 has the category \[1\], but the known",
-        ),
+        (with_segment(1, category_id=[1]),
+         r"the segment 300 has the category \[1\], but the known"),
         (with_segment(1, category_id=True), "has the category True, but the known"),
         (with_segment(1, id=[300]), r"a whole number above 0, .*, got \[300\]"),
         (with_entry("categories", None), "format: 'categories' must be a list, got None"),
@@ -348,7 +344,7 @@ def with_first(list_, **entries):
         (with_first("categories", name=None), "format: 'name' must be a text, got None"),
         (lambda first, content: content["categories"][0].pop("name"), "it lacks 'name' in {'"),
     ],
-)
+)  # fmt: skip
 def test_wrong_annotations_of_coco_are_named(tmp_path, change, message):
     with pytest.raises(ValueError, match=rf"panoptic_train2017\.json.*{message}|{message}"):
         annotated(tmp_path, change)
