@@ -69,6 +69,8 @@ def closest(model: str, lens: Lens, path: str | os.PathLike, format: str | None)
     """`fit` of a model to one lens, without what the format of a path cannot hold: tangential and
     prism terms, further radial ones, and skew. If it cannot hold the model, as `fit`."""
     whole = fit(model, lens)
+    if not is_held(_bare(whole.lens), path, format):
+        return whole
     for found in _simpler(whole.lens, model, lens):
         if is_held(found, path, format):
             return Fit(found, largest_distance(found, lens))
@@ -78,13 +80,21 @@ def closest(model: str, lens: Lens, path: str | os.PathLike, format: str | None)
 def _simpler(found: Lens, model: str, lens: Lens) -> Iterator[Lens]:
     """A fitted lens, and then lenses of its model with fewer and fewer terms."""
     yield from _less_skewed(found)
-    if not isinstance(found, DistortedLens):
+    if not isinstance(found, DistortedLens) or found.radial is None:
         return
     for terms in (None, 2):
         for left_out in (("prism",), ("prism", "tangential")):
             given = lens.replace(**dict.fromkeys({*left_out} & {*lens.optional}))
             fitted = fit(model, given, terms=terms).lens
             yield from _less_skewed(fitted.replace(**dict.fromkeys(left_out)))
+
+
+def _bare(lens: Lens) -> Lens:
+    """A lens with the fewest terms of its model, which a format holds if it holds any."""
+    lens = lens.replace(affine=None)
+    if not isinstance(lens, DistortedLens) or lens.radial is None:
+        return lens
+    return lens.replace(tangential=None, prism=None, radial=lens.radial[:, :2])
 
 
 def _less_skewed(lens: Lens) -> Iterator[Lens]:
