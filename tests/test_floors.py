@@ -21,7 +21,8 @@ FLOORS = (
     ("views",),
     ("calibrate", "data"),
     ("boxes", "lens"),
-    ("ops", "utils"),
+    ("ops",),
+    ("utils",),
 )
 MOST_LINES = 400
 

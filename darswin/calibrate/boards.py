@@ -120,12 +120,27 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         return "" if known else f"{columns}x{rows} inner corners"
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
-    found = {}
-    for name in sorted(_names(), key=lambda name: name != board.dictionary):
-        numbers = cv2.aruco.ArucoDetector(_dictionary(name)).detectMarkers(grey)[1]
-        found[name] = [] if numbers is None else numbers.ravel().tolist()
-    name, seen = max(found.items(), key=lambda item: len(item[1]))
-    return f"markers {min(seen)} to {max(seen)} of {name}" if len(seen) > 3 else ""
+    parameters, found = cv2.aruco.DetectorParameters(), {}
+    for name in _names():
+        for parameters.markerBorderBits in (1, 2) if board.kind == "april" else (1,):  # Kalibr's: 2
+            detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
+            seen = [] if (numbers := detect(grey)[1]) is None else numbers.ravel().tolist()
+            found[name] = max(found.get(name, []), seen, key=len)
+    most = max(map(len, found.values()))
+    if most < 4:
+        return ""
+    # The larger sets of a kind contain the smaller ones, and find more that is no marker.
+    near = [name for name, seen in found.items() if len(seen) > 0.75 * most]
+    name = min(near, key=lambda n: (n != board.dictionary, len(_dictionary(n).bytesList)))
+    seen, said = sorted(found[name]), f"markers {min(found[name])} to {max(found[name])} of {name}"
+    cells = (board.columns + 1) * (board.rows + 1) // 2
+    count = board.columns * board.rows // 4 if board.kind == "april" else cells
+    if name != board.dictionary or seen[len(seen) // 2] >= count:
+        return said
+    why = "the markers are too small or cut off, or columns and rows are swapped"
+    if board.kind == "april":
+        why = "columns and rows are swapped, or the gap is a ratio in place of a length"
+    return f"{said}, as the board has them, but no corners of it: maybe {why}"
 
 
 def wrong(grid: np.ndarray, board: Board) -> np.ndarray:

@@ -19,9 +19,12 @@ COVERED = 0.8  # of theta_max
 SHOWN = 10  # corners
 
 
-def doubts(found: Calibration, seen: Tensor, middle: Tensor, stretch: float) -> list[str]:
+def doubts(
+    found: Calibration, seen: Tensor, middle: Tensor, stretch: tuple[float, float]
+) -> list[str]:
     """What looks wrong, in sentences; seen: (P, K); middle: (3,), of the board's points; stretch:
-    how much longer than in x things seem in y, as a part of their length.
+    how much longer than in x things seem in y, as a part of their length: in the picture, and on
+    the board.
 
     Raises:
         CalibrationError: the pictures do not determine the lens.
@@ -72,12 +75,7 @@ def doubts(found: Calibration, seen: Tensor, middle: Tensor, stretch: float) -> 
             f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
             "or another model fits better"
         )
-    if abs(stretch) > STRETCHED:
-        longer = "longer" if stretch > 0 else "shorter"
-        said.append(
-            f"lengths along y seem {100 * abs(stretch):.2g} % {longer} than along x: take pictures "
-            "that were not resized, or find the ratio with square_pixels=False"
-        )
+    said += _stretched(*stretch)
     far = middles.norm(dim=1)
     if far.max() < ONE_DISTANCE * far.min():
         said.append("all boards are at one distance: take some nearer and some farther")
@@ -90,5 +88,26 @@ def doubts(found: Calibration, seen: Tensor, middle: Tensor, stretch: float) -> 
         said.append(
             f"corners reach {math.degrees(found.supported):.0f}° from the axis, but the sensor "
             f"{math.degrees(end):.0f}°: in between, the lens is a guess"
+        )
+    return said
+
+
+def _stretched(picture: float, board: float) -> list[str]:
+    """What looks wrong with the ratio of sides of the pixels and of the board."""
+    longer = f"{100 * abs(picture):.2g} % {'longer' if picture > 0 else 'shorter'} than along x"
+    pixels = "take pictures that were not resized, or find the ratio with square_pixels=False"
+    if picture == board and abs(board) > STRETCHED:
+        return [
+            f"lengths along y seem {longer}, of the pixels or of the board: measure the board's "
+            f"sides, and turn it by a quarter in some pictures; {pixels}"
+        ]
+    said = []
+    if abs(picture) > STRETCHED:
+        said.append(f"lengths along y seem {longer}: {pixels}")
+    if abs(board) > STRETCHED:
+        longer = f"{100 * abs(board):.2g} % {'longer' if board > 0 else 'shorter'}"
+        said.append(
+            f"the board seems {longer} along its columns than along its rows: measure it, since "
+            "printers stretch"
         )
     return said

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.calibrate import radial
@@ -147,7 +148,7 @@ def calibrate(
         _vector=best.state.vector,
         _joint=best.joint,
     )
-    stretch = best.stretch(views, counts) if square_pixels else 0.0
+    stretch = best.stretch(views, counts)
     calibration.doubts.extend(doubts(calibration, whole.seen, spot, stretch))
     return calibration
 
@@ -189,14 +190,32 @@ class _Found:
             moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
             self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
 
-    def stretch(self, views: Views, counts: Tensor) -> float:
-        """How much longer than in x things seem in y, as a part of their length; 0 if it may be
-        chance."""
+    def stretch(self, views: Views, counts: Tensor) -> tuple[float, float]:
+        """How much longer than in x things seem in y, as a part of their length: in the picture,
+        and on the board; 0 if it may be chance. Boards that never turn in the picture cannot tell
+        one from the other, and both are then the same."""
         free = Free(self.state.lens, square_pixels=False)
-        normal = self._normal(views, counts, free)[-1]
-        last = len(free.start) - 1
-        found, variance = normal.steps()[0, last].item(), normal.covariance()[last, last].item()
-        return found if abs(found) > OFF * max(self.sigma, SHARPEST) * math.sqrt(variance) else 0.0
+        miss, used, slopes, alone = self._normal(views, counts, free)
+        last, least = len(free.start), OFF * max(self.sigma, SHARPEST)
+        # One more number of all pictures moves the board's points along its y axis.
+        along = self.state.rotations[counts.any(1), None, :, 1] * views.board[:, 1:2]
+        slopes = torch.cat(
+            (slopes[..., :last], slopes[..., -3:] @ along[..., None], slopes[..., last:]), -1
+        )
+        free.low, free.high = (
+            F.pad(e, (0, 1), value=v) for e, v in ((free.low, -math.inf), (free.high, math.inf))
+        )
+        vector = F.pad(free.start, (0, 1), value=1.0)
+        both = Normal(slopes, miss, used.to(miss), free, vector).damped(0.0)
+
+        def sure(normal: Normal, place: int) -> float:
+            found, variance = normal.steps()[0, place].item(), normal.covariance()[place, place]
+            return found if abs(found) > least * math.sqrt(variance.item()) else 0.0
+
+        picture, board = sure(both, last - 1), sure(both, last)
+        if not (picture or board):
+            picture = board = sure(alone, last - 1)
+        return picture, board
 
     def _normal(
         self, views: Views, counts: Tensor, free: Free

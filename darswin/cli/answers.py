@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from darswin.cli.arguments import can_write
 from darswin.data.reframing import at_size
 from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.data.warping import CutOff, FullSize, cut_off, picture_size
@@ -356,6 +357,8 @@ def claim_folder(out: str | None, record: str = ANSWERS) -> Path:
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
+    if not can_write(folder.absolute()):
+        raise ValueError(f"--out must be a folder that can be written, got {out}")
     if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
         raise ValueError(
             f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "

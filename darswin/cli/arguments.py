@@ -5,6 +5,7 @@ import inspect
 import json
 import os
 import re
+import tempfile
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -98,13 +99,25 @@ def check_out(
     if out is None:
         return
     path = Path(out).absolute()
-    there = next(folder for folder in (path, *path.parents) if folder.exists())
-    fits = may_be_folder or not path.is_dir()
-    if not (fits and (there == path or there.is_dir()) and os.access(there, os.W_OK)):
+    fits = (may_be_folder or not path.is_dir()) and can_write(path)
+    if not fits:
         raise ValueError(f"--{option} must be a file in a folder that can be written, got {out}")
     for name in inputs:
         if all(map(os.path.isfile, (name, out))) and os.path.samefile(name, out):
             raise ValueError(f"--{option} {out} would replace {name}, which this command reads")
+
+
+def can_write(path: Path) -> bool:
+    """True if a file or a folder can be written; tried where it would be made, since rights alone
+    do not tell."""
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
+    if not there.is_dir():
+        return there == path and os.access(there, os.W_OK)
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            return True
+    except OSError:
+        return False
 
 
 def _summary(function: Callable) -> str:

@@ -4,10 +4,8 @@ import json
 import math
 import os
 import re
-import tempfile
 from collections import Counter
-from collections.abc import Collection, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -15,7 +13,8 @@ import torch
 import darswin.lens
 from darswin.cli.arguments import check_out
 from darswin.lens.base import Lens
-from darswin.lens.files.load import reach
+from darswin.lens.files.load import Calibration, reach
+from darswin.lens.files.save import is_held
 from darswin.utils.exif import TURNS
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
@@ -23,7 +22,8 @@ from darswin.utils.parameters import check, with_flags
 if TYPE_CHECKING:
     import numpy as np
 
-    from darswin.calibrate import Board, Calibration
+    from darswin.calibrate import Board
+    from darswin.calibrate import Calibration as Found
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 Kind = Literal["chessboard", "charuco", "april"]
@@ -81,7 +81,7 @@ def calibrate(
     names = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
     outs = {"out": out, "picture": picture, "report": report}
     for option, file in outs.items():
-        check_out(file, names, option)
+        (check_lens_out if option == "out" else check_out)(file, names, option)
     written = [os.path.realpath(file) for file in outs.values() if file is not None]
     if len({*written}) < len(written):
         raise ValueError("--out, --picture and --report must be different files")
@@ -98,7 +98,7 @@ def calibrate(
     with Progress("calibrate") as progress:
         found = found_by(
             seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
-            square_pixels=square_pixels, accept=lambda lens: _is_held(lens, out, format),
+            square_pixels=square_pixels, accept=lambda lens: is_held(lens, out, format),
             progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
     lens = _within(seen.brightest, found.lens)
@@ -123,14 +123,16 @@ def calibrate(
         raise BrokenImageError("\n".join(seen.bad))
 
 
-def _is_held(lens: Lens, out: str, format: Format | None) -> bool:
-    """True if the file's format can hold the lens."""
-    with tempfile.TemporaryDirectory() as folder:
+def check_lens_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
+    """`check_out` of a calibration, which may replace a calibration, but no other file."""
+    check_out(out, inputs, option)
+    if out is not None and os.path.isfile(out) and os.path.getsize(out):
         try:
-            darswin.lens.save(lens, Path(folder) / Path(out).name, format)
-        except ValueError:
-            return False
-    return True
+            Calibration.read(out)
+        except ValueError as error:
+            raise ValueError(
+                f"--out {out} would replace a file that is no calibration: give a new name"
+            ) from error
 
 
 def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
@@ -252,7 +254,7 @@ def _within(brightest: "np.ndarray", lens: Lens) -> Lens:
     return lens.with_theta_max(theta) if math.isfinite(theta) else lens
 
 
-def _summary(found: "Calibration", seen: _Seen, lens: Lens) -> str:
+def _summary(found: "Found", seen: _Seen, lens: Lens) -> str:
     corners = int((found.weights > 0.1).sum())
     rows = [
         ("pictures", f"{int(found.used.sum())} of {seen.total}"),

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from darswin.cli.arguments import check_out
-from darswin.cli.calibrate import write_lens
+from darswin.cli.calibrate import check_lens_out, write_lens
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check
 
@@ -41,8 +41,8 @@ def estimate(
     files = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
     if not files:
         raise ValueError(f"no pictures in {', '.join(pictures)}")
-    for written in filter(None, (out, report)):
-        check_out(written, files)
+    check_lens_out(out, files)
+    check_out(report, files, "report")
     found = estimate_lens(
         [read_stored(file) for file in files],
         model,

@@ -4,15 +4,15 @@ import math
 
 import torch
 
-import darswin.lens
 from darswin.cli.arguments import check_out
-from darswin.cli.calibrate import Format, calibrate, write_lens
+from darswin.cli.calibrate import Format, calibrate, check_lens_out, write_lens
 from darswin.cli.estimate import estimate
 from darswin.cli.undistort import undistort
 from darswin.cli.views import Look, Up, View
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.save import closest
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
 from darswin.utils.parameters import check
@@ -145,7 +145,9 @@ def convert(
     Args:
         calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
-        model: the lens model to fit, a name of darswin.lens.MODELS. The default keeps the model.
+        model: the lens model to fit, a name of darswin.lens.MODELS. Terms that the model or the
+            format cannot hold are left out; the command prints how far the lens then is from the
+            given one. The default keeps the model.
         theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
             largest angle that the images show.
         image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
@@ -155,14 +157,27 @@ def convert(
             Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and else the JSON
             of darswin, which can hold any lens.
     """
-    check_out(out, (calib,))
+    check_lens_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
     note = ""
     if model is not None:
-        lens, error = darswin.lens.fit(model, lens)
-        note = f", at most {error.item():.2g} px from {calib}"
+        exact = lens
+        lens, error = closest(model, exact, out, format)
+        note = f", at most {error.item():.2g} px from {calib}{_dropped(lens, exact)}"
     write_lens(lens, out, format, note)
+
+
+def _dropped(lens: Lens, exact: Lens) -> str:
+    """The parts of a lens that a lens of another model or format does not have, in words."""
+    parts = [
+        f"{name} terms"
+        for name in ("tangential", "prism")
+        if getattr(exact, name, None) is not None and getattr(lens, name, None) is None
+    ]
+    if exact.affine is not None and not torch.equal(lens.affine, exact.affine):
+        parts.append("skew")
+    return f", whose {' and '.join(parts)} it leaves out" if parts else ""
 
 
 def crop(
@@ -192,7 +207,7 @@ def crop(
     for name, sides in (("box", (box or ())[2:]), ("size", size or ())):
         for side in sides:
             check(name, side, 1 <= side <= 10**6, _SIDES)
-    check_out(out, (calib,))
+    check_lens_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""
     if box is not None:

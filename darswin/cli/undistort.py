@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import darswin.lens
-from darswin.cli.views import Look, Up, View
+from darswin.cli.views import Look, Up, View, to_corners
 from darswin.lens import Lens, Perspective
 from darswin.lens.files.load import reach
 from darswin.lens.files.opencv import Coefficients
@@ -176,7 +176,7 @@ class _Views:
         if self._look.view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
             camera = Perspective.from_fov(fov, width / 2, image_size=(height, width))
-            camera = camera.with_theta_max(reach(camera.with_theta_max(None)))
+            camera = to_corners(camera)
         return _Viewed(Sampler(plan(view, exact, size, output="uint8")), lens, camera)
 
 

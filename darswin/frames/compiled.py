@@ -2,9 +2,12 @@
 
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Protocol, cast
 
 import numpy as np
+
+from darswin.utils.elf import check_whole
 
 
 class Sample(Protocol):
@@ -60,6 +63,8 @@ class Frames(Protocol):
 
 
 try:
+    if (found := find_spec("darswin.frames._frames")) and found.origin:
+        check_whole(found.origin)
     frames = cast(Frames, import_module("darswin.frames._frames"))
 except ImportError as error:
     raise ImportError(

@@ -6,7 +6,8 @@ Every lens is a batch, is differentiable in its parameters, and works beyond 90Â
 from darswin.lens.base import MODELS, Lens, from_dict, to_dict
 from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
-from darswin.lens.files.load import load, load_all, load_up, save
+from darswin.lens.files.load import load, load_all, load_up
+from darswin.lens.files.save import save
 from darswin.lens.fitting import Fit, fit
 from darswin.lens.ideal import (
     Equidistant,

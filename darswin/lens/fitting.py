@@ -64,8 +64,8 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
 def largest_distance(lens: Lens, other: Lens) -> Tensor:
     """(N,) px: the largest distance between the pixels of a ray in two lenses with one center."""
     theta, direction = _rays(other, 1024, 72)
-    apart = lens._flat(theta, direction) - other._flat(theta, direction)
-    return other.through_affine(apart).norm(dim=-1).flatten(1).amax(1)
+    one, two = (each.through_affine(each._flat(theta, direction)) for each in (lens, other))
+    return (one - two).norm(dim=-1).flatten(1).amax(1)
 
 
 def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:

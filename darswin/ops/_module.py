@@ -13,6 +13,8 @@ from pathlib import Path
 
 import torch
 
+from darswin.utils.elf import check_whole
+
 FILE = Path(__file__).parent.parent / "libdarswin.so"
 REFERENCE = "reference"  # the name of the only tier without the module
 
@@ -32,8 +34,9 @@ def load() -> ctypes.CDLL:
             "systems and processors without such a module"
         )
     try:
+        check_whole(FILE)
         torch.ops.load_library(FILE)
-    except OSError as error:
+    except (OSError, ImportError) as error:
         reason = error.__cause__ or error  # torch's own error only names the file
         raise ImportError(
             f"cannot load the compiled module of darswin, {FILE}: {reason}. It is built on "

@@ -39,10 +39,10 @@ def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> 
     """Writes a new file beside the old one, then replaces the old one. Creates the folder. If an
     OSError is raised, it names `path`, and the old file is unchanged."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     data = content.encode() if isinstance(content, str) else content
     temporary = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(
             prefix=f".{path.name}.", suffix=_PARTIAL, dir=path.parent, delete=False
         ) as file:

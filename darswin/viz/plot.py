@@ -254,28 +254,26 @@ def draw_curve(lens: Lens, image_size: tuple[int, int] | None = None, *, axes: A
         _draw_sides(axes, lens, image_size)
     axes.legend(
         handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3, handlelength=1,
-        columnspacing=1,
+        columnspacing=1, framealpha=1,
     )  # fmt: skip
 
 
 def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
-    """Draws a line at the angle of each side of the image that lies within θ_max. Lines that are
-    close to each other share a label."""
+    """Draws a line at the angle of each side of the image that lies within θ_max. The label of the
+    axis names them, since texts beside the lines would cross the curves."""
     angles = torch.rad2deg(lens.side_angles(image_size)[0]).tolist()
     ends, last = beyond_lens(lens, image_size).tolist(), axes.get_xlim()[1]
-    labels: dict[float, dict[str, list[str]]] = {}  # sides by the place of a label and their angle
-    for side, style, angle, beyond in zip(SIDES, ("--", ":", "--", ":"), angles, ends, strict=True):
-        if beyond or angle > last + 1e-6:
-            continue
-        axes.axvline(angle, color="0.4", ls=style, lw=1)
-        place = next((at for at in labels if abs(at - angle) < 0.06 * last), angle)
-        labels.setdefault(place, {}).setdefault(f"{angle:.0f}°", []).append(side)
-    for place, sides in labels.items():
-        text = ", ".join(f"{', '.join(names)} {angle}" for angle, names in sides.items())
-        axes.text(
-            place, 0.02, text, transform=axes.get_xaxis_transform(), rotation=90,
-            ha="right", va="bottom", color="0.3", path_effects=_outline(1.2, "white"),
-        )  # fmt: skip
+    labels: dict[str, dict[str, list[str]]] = {}  # sides by the style of their line and their angle
+    styles = ("dashed", "dotted", "dashed", "dotted")
+    for side, style, angle, beyond in zip(SIDES, styles, angles, ends, strict=True):
+        if not beyond and angle <= last + 1e-6:
+            axes.axvline(angle, color="0.4", ls=style, lw=1)
+            labels.setdefault(style, {}).setdefault(f"{angle:.0f}°", []).append(side)
+    lines = [axes.get_xlabel()]
+    for style, sides in labels.items():
+        text = ", ".join(f"{' and '.join(names)} {angle}" for angle, names in sides.items())
+        lines.append(f"{style}: {text}")
+    axes.set_xlabel("\n".join(lines))
 
 
 def draw_lens(

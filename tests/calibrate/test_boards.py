@@ -9,7 +9,13 @@ import torch
 from calibrate_boards import Pose, Renderer
 
 from darswin.calibrate import Board, find_corners
-from darswin.calibrate.boards import edge_width, image_circle, pixels_per_unit, wrong
+from darswin.calibrate.boards import (
+    edge_width,
+    image_circle,
+    pixels_per_unit,
+    shown_instead,
+    wrong,
+)
 from darswin.lens import Equidistant, Lens, Perspective
 
 CHESSBOARD = Board.chessboard(9, 6, 0.025)
@@ -327,3 +333,29 @@ def test_small_pictures_show_nothing(size):
     for board in boards:
         assert np.isnan(find_corners(picture, board)).all()
     assert image_circle([picture]) is None and image_circle([0 * picture]) is None
+
+
+@pytest.mark.parametrize(
+    ("board", "said"),
+    [
+        (Board.april_grid(6, 4, 0.04, 0.3), "the gap is a ratio"),
+        (Board.april_grid(4, 6, 0.04, 0.012), "columns and rows are swapped"),
+        (Board.april_grid(6, 4, 0.04, 0.012, dictionary="APRILTAG_25h9"), "of APRILTAG_36h11"),
+        (Board.april_grid(3, 3, 0.04, 0.012), "markers 0 to 23 of APRILTAG_36h11"),
+    ],
+)
+def test_tags_that_do_not_fit_the_board_are_told(board, said):
+    known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    drawn = cv2.aruco.GridBoard((6, 4), 0.04, 0.012, known)
+    picture = drawn.generateImage((620, 420), marginSize=20)
+    assert np.isnan(find_corners(picture, board)).all()
+    assert shown_instead(picture, board).startswith("markers 0 to 23 of APRILTAG_36h11")
+    assert said in shown_instead(picture, board)
+
+
+def test_the_smallest_set_of_markers_is_named():
+    known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    drawn = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, known).generateImage((640, 480))
+    for dictionary, named in (("5X5_250", "4X4_50"), ("4X4_250", "4X4_250")):
+        board = Board.charuco(6, 8, 0.03, 0.022, dictionary=dictionary)
+        assert f"markers 0 to 23 of {named}" in shown_instead(drawn, board)

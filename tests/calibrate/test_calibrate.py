@@ -10,6 +10,7 @@ from helpers import slow_but
 from rigs import WIDEST, board, f64, ray_errors, rig, true_lens, turn
 
 from darswin.calibrate import CalibrationError, calibrate
+from darswin.calibrate.doubts import _stretched
 from darswin.calibrate.refine import Free, State, Views, refine
 from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
 from darswin.lens.solve import vector_of
@@ -228,6 +229,29 @@ def test_pixels_that_are_not_square_are_doubted(model):
         assert len(doubts) == (words is not None) and (not doubts or words in doubts[0])
         found = of(seen, model, square_pixels=False)
         assert not [text for text in found.doubts if "lengths along y" in text]
+
+
+def test_a_stretched_board_is_doubted():
+    lens = true_lens("KannalaBrandt", 120, seed=1)
+    for ratio, words in ((1.01, "1 % longer"), (0.99, "1 % shorter"), (1.0, None)):
+        seen = rig(lens, 12, board() * torch.tensor([1, ratio]), noise=0.05)
+        for square in (True, False):
+            found = calibrate(
+                seen.corners, board(), seen.size, "KannalaBrandt", square_pixels=square
+            )
+            doubts = [text for text in found.doubts if "along" in text]
+            assert len(doubts) == (words is not None)
+            assert not doubts or doubts[0].startswith(f"the board seems {words} along its columns")
+
+
+def test_pixels_and_boards_that_never_turn_cannot_be_told_apart():
+    said = ["of the pixels or of the board: measure"], ["the board seems"], ["seem 1 % longer"], []
+    for stretch, words in zip(((0.01, 0.01), (0, 0.01), (0.01, 0), (0, 0)), said, strict=True):
+        found = _stretched(*stretch)
+        assert len(found) == len(words) and all(map(str.__contains__, found, words))
+    still = rig(true_lens("KannalaBrandt", 120, seed=1), 12, noise=0.05, spin=0.0)
+    (doubt,) = (text for text in of(stretched(still, 1.01)).doubts if "along" in text)
+    assert "of the pixels or of the board" in doubt
 
 
 @pytest.mark.slow

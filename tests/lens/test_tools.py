@@ -39,7 +39,7 @@ TOOLS = {
     "a bag's": ("rosbag2_bagfile_information:\n  version: 4\n", "camera_info message in the bag"),
     "COLMAP's images": ("1 0.8 0.1 0.2 0.5 1.0 2.0 3.0 1 a.png\n23.3 4 -1\n", "take cameras.txt"),
     "a ROS bag": (b"#ROSBAG V2.0\nE\0\0\0", "it is a ROS bag"),
-    "COLMAP's images.bin": (np.array([9, 99 << 32], "<u8").tobytes() + bytes(64), "have no cameras"),
+    "images.bin": (np.array([9, 99 << 32], "<u8").tobytes() + bytes(64), "have no cameras"),
 }  # fmt: skip
 # What errors of our formats ask for.
 OURS = ("poly_order", "value0", "OpenCV calibration", "camera_matrix", "projection_parameters",

@@ -12,7 +12,6 @@ from darswin.lens.base import MODELS, Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
 from darswin.lens.image import Size
-from darswin.utils.parameters import naming
 
 # For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
 # the whole sensor, and the height and width of that image, px.
@@ -81,11 +80,11 @@ class Format:
             raise ValueError(f"{self.name} files need the lens's image_size, but it has none")
         text = None if camera is None else self._text(camera, suffix)
         if text is None:
-            text = (
+            raise ValueError(
                 f"{self.name} files cannot hold this {type(lens).__name__} lens exactly. They hold "
-                f"{self.holds}. darswin.lens.fit finds the closest lens of another `model`"
+                f"{self.holds}. `darswin lens convert --model` writes the closest lens of one of "
+                "these models, without what they cannot hold"
             )
-            raise naming(ValueError(text), "model")
         return text
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:

@@ -1,12 +1,10 @@
-"""Reads and writes calibration files of all formats."""
+"""Reads calibration files of all formats."""
 
 import math
 import os
-import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -26,7 +24,6 @@ from darswin.lens.files.unknown import program_of, unknown
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
-from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, naming
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
@@ -39,10 +36,6 @@ FORMATS: tuple[Format, ...] = (
     opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
 _UNKNOWN = "unknown format: {}. The formats are " + ", ".join(format.name for format in FORMATS)
-# The formats that `save` writes.
-WRITTEN: dict[str, Format] = {
-    "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": Kalibr()
-}  # fmt: skip
 
 
 def load(
@@ -109,34 +102,6 @@ def load_up(path: str | os.PathLike) -> tuple[float, float, float]:
         OSError: the file cannot be opened.
     """
     return Calibration.read(path).up()
-
-
-def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
-    """Writes one lens to a file that `load` reads, and returns the name of the format.
-
-    Our own JSON holds any lens. The other formats hold the lenses of their own models, without
-    θ_max: `load` finds it from the image's sides.
-
-    Args:
-        format: "darswin", "opencv", "colmap" or "kalibr". None chooses by the path: OpenCV for
-            .xml, .yaml and .yml, but Kalibr if the name contains "camchain" or "kalibr"; COLMAP
-            for .txt; else our own JSON.
-
-    Raises:
-        ValueError: several lenses, a lens of a model that is not in `MODELS`, or a lens that the
-            format cannot hold exactly.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if format is None:
-        by_suffix = {".xml": "opencv", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
-        format = by_suffix.get(suffix, "darswin")
-        if suffix in (".yaml", ".yml") and re.search("camchain|kalibr", path.stem.lower()):
-            format = "kalibr"
-    if format not in WRITTEN:
-        raise ValueError(f"format must be {', '.join(WRITTEN)} or None, got {format!r}")
-    replace_file(path, WRITTEN[format].write(lens, suffix))
-    return format
 
 
 class Calibration:
