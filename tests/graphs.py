@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import onnx
 import onnx.parser
+from onnx import TensorProto, helper, numpy_helper
 
 # Of pictures x, (B, 3, H, W), in [0, 1]: the box of all pixels above 0.5; as its score the share of
 # their number in that number and 20, and half of it if one is at a border; as its class the channel
@@ -69,11 +71,6 @@ OUTPUTS = {
     "class before score": (
         "float[B,N,6] found", "found = Concat<axis=2>(box1, class2, score2)",
     ),
-    "parts": (
-        "float[B,N,6] found",
-        "wide = Constant<value_float=1000.0>() small = Div(box1, wide) "
-        "found = Concat<axis=2>(small, score2, class2)",
-    ),
     "nan boxes": (
         "float[B,N,6] found",
         "zero = Sub(score2, score2) nan = Div(zero, zero) "
@@ -120,4 +117,23 @@ def write_graph(
         network ({dtype}[{axes}] images{extra}) => ({declared}) {{ {" ".join(reads)}
         {_FINDS} {last} }}"""
     onnx.save(onnx.parser.parse_model(text), path)
+    return path
+
+
+def write_constants(path: Path, size: tuple[int, int], **outputs: np.ndarray) -> Path:
+    """Writes a network of pictures (1, 3, H, W) that always gives the same outputs."""
+    nodes = [
+        helper.make_node("Constant", [], [name], value=numpy_helper.from_array(value))
+        for name, value in outputs.items()
+    ]
+    declared = [
+        helper.make_tensor_value_info(
+            name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
+        )
+        for name, value in outputs.items()
+    ]
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, *size])
+    graph = helper.make_graph(nodes, "network", [images], declared)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    onnx.save(model, path)
     return path

@@ -3,7 +3,7 @@
 import argparse
 import inspect
 import textwrap
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,6 +16,11 @@ from darswin.utils.text import read_text
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
 FIRST_TASK: Task = "classification"  # unless a run names another one
+# What these commands do with a file in place of the folder of a run.
+_TAKES = {
+    ".ckpt": "--ckpt_path takes a checkpoint",
+    "": "--model.weights takes a model to start from, `darswin predict --model` one to use",
+}
 # Options that take a file of a group's options, and the option that was probably meant.
 FILES = {"data": "--data.path", "model": "--model.name", "trainer": ""}
 
@@ -37,7 +42,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     contents = {file: content_of(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
-        check_folder(Path(given.run))
+        check_folder(Path(given.run), _TAKES)
         others += ["--run", given.run]
         own = Path(given.run) / "config.yaml"
         if argv[0] == "fit" and not given.resume:
@@ -134,19 +139,17 @@ def last_of(folder: Path) -> Path:
     return folder / "checkpoints" / "last.ckpt"
 
 
-def check_folder(run: Path) -> None:
-    """ValueError for a file in place of the folder of a run."""
+def check_folder(run: Path, takes: Mapping[str, str]) -> None:
+    """ValueError for a file in place of the folder of a run. `takes` says what the command does
+    with a file of each ending; "" is any other."""
     if not run.is_file():
         return
-    if run.suffix == ".ckpt":
-        use = "--ckpt_path takes a checkpoint"
-    else:
-        use = "--model.weights takes a model to start from, `darswin predict --model` one to use"
+    use = takes.get(run.suffix, takes.get("", ""))
     above = run.parent.parent
     hint = f"; this one belongs to the run {above}" if (above / "config.yaml").exists() else ""
     raise ValueError(
         f"--run names the folder in which `darswin fit` keeps all of a training, but {run} is a "
-        f"file{hint}. {use}"
+        f"file{hint}" + f". {use}" * bool(use)
     )
 
 

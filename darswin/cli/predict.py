@@ -123,7 +123,7 @@ def predict(
             + ", or --network, an ONNX file"
         )
     if run is not None:
-        check_folder(Path(run))
+        check_folder(Path(run), {".safetensors": "--model takes a model"})
         weights: str | Path = model_of_run(run)
     elif model is not None:
         weights = Path(model_file(model))

@@ -1,6 +1,7 @@
 """`darswin quantize`: the model of a run with weights and activations of 8 bits."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from darswin.models.base import Model
 from darswin.models.saving import load_model, model_of_run, save_model
 from darswin.train.data import RunData
 from darswin.train.tasks import TASKS
-from darswin.utils.parameters import check
+from darswin.utils.parameters import check, with_flags
 from darswin.utils.progress import Progress
 from darswin.utils.text import read_text
 
@@ -51,13 +52,19 @@ def quantize(
             folder of the run.
     """
     check("pictures", pictures, pictures >= 1, "at least 1")
-    check_folder(Path(run))
+    check_folder(Path(run), {})
     weights = model_of_run(run)
     check_out(out, [str(weights)])
     model, card = load_model(weights)
-    data = _data_of(Path(run))
-    with Progress("reading training pictures"):
-        seen = list(_batches(data, "train", pictures))
+    with _with_names_of(Path(run)):
+        config = yaml.safe_load(read_text(Path(run) / "config.yaml"))
+        data = _data_of(config)
+        with Progress("reading training pictures"):
+            seen = list(_batches(data, "train", pictures))
+        if (config.get("trainer") or {}).get("limit_val_batches") == 0:
+            held = []  # trained without validation
+        else:
+            held = list(_batches(data, "val", pictures))
     quantized = quantize_model(model, seen, keep=keep or (), tolerance=tolerance)
     layers = quantized_layers(quantized)
     path = Path(out) if out else weights.with_name(f"{weights.stem}.int8.safetensors")
@@ -67,15 +74,28 @@ def quantize(
     sizes = [file.stat().st_size / 2**20 for file in (weights, path)]
     print(f"{path}: {len(layers)} of {whole} linear layers have 8 bits")
     print(f"{sizes[0]:.1f} MiB → {sizes[1]:.1f} MiB")
+    if not held:
+        print("the run has no validation pictures to compare both models on")
+        return str(path)
     with Progress("comparing both models on validation pictures"):
-        lines = list(_comparison(model, quantized, card.task, _batches(data, "val", pictures)))
+        lines = list(_comparison(model, quantized, card.task, held))
     print(*lines, sep="\n")
     return str(path)
 
 
-def _data_of(run: Path) -> RunData:
+@contextmanager
+def _with_names_of(run: Path) -> Iterator[None]:
+    """Errors of the data name the entries of the run's configuration: this command has no options
+    for them."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        said = with_flags(error, "data.{}".format)
+        raise ValueError(f"the data of {run / 'config.yaml'}: {said}") from None
+
+
+def _data_of(config: dict[str, Any]) -> RunData:
     """The data of a run, from its configuration."""
-    config = yaml.safe_load(read_text(run / "config.yaml"))
     options = config["data"] | dict(batch_size=BATCH, workers=0)
     return TASKS[config.get("task", FIRST_TASK)].data(**options)
 

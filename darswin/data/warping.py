@@ -162,15 +162,14 @@ class FullSize:
         top, left, self._height, self._width = taken_part(picture_size(lens), fit)
         self._part = np.s_[top : top + self._height, left : left + self._width]
         self.reached = _reached(lens_at_size(lens, size, fit))
-        whole = np.ones((self._height, self._width), bool)
+        near = self._enlarged(self.reached)
         if shown is not None:
-            is_shown = shown.cpu().numpy().reshape(self.reached.shape)
-            self.reached &= is_shown
-            whole = self._enlarged(is_shown) > 0.5
+            self.reached &= shown.cpu().numpy().reshape(self.reached.shape)
         self._weight = self._enlarged(self.reached)
         reached = _reached(lens)
         self.seen = np.zeros_like(reached)
-        self.seen[self._part] = reached[self._part] & whole & (self._weight > 0)
+        # Pixels that the lens sees, and of which the view shows more than a half.
+        self.seen[self._part] = reached[self._part] & (self._weight > 0.5 * near)
 
     def labels(self, logits: np.ndarray) -> np.ndarray:
         """The classes with the largest logits.

@@ -21,6 +21,7 @@ from darswin.layers.quantized import (
 from darswin.layers.transformer import Mlp, PatchMerging
 from darswin.lens import Lens
 from darswin.models.base import Model
+from darswin.utils.parameters import naming
 from darswin.utils.progress import Progress
 
 __all__ = ["quantize_model", "sensitivities"]
@@ -82,7 +83,8 @@ def quantize_model(
             result = found.quantized(chosen)
             error = found.error(result)
     if error > tolerance:
-        raise ValueError(f"with 8 bits, every part of the model exceeds the tolerance {tolerance}")
+        text = f"with 8 bits, every part of the model exceeds the `tolerance` {tolerance}"
+        raise naming(ValueError(text), "tolerance")
     return result
 
 

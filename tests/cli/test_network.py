@@ -13,7 +13,7 @@ from PIL import Image
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from graphs import write_graph
+from graphs import write_constants, write_graph
 
 from darswin.cli.main import main
 from darswin.utils.video import write_frames
@@ -212,7 +212,7 @@ def test_colours_and_their_normalization_are_the_networks(disc, tmp_path):
         (["--mean", "0.2,0.3,0.6", "--std", "1,1,1"], 0),
         (["--mean", "0.6,0.3,0.2", "--std", "1,1,1"], 1),
         (["--mean", "0.6,0.3,0.2", "--channels", "bgr"], 0),
-        (["--std", "3"], 0),
+        (["--std", "0.3"], 1),
     ):
         (found,) = run_tiles(folder, network, *argv, picture="blue.png")
         assert len(found["detections"]) == count, argv
@@ -243,9 +243,8 @@ def test_gravity_and_a_field_of_view_change_what_is_seen(disc, tmp_path):
     assert mercator == default
 
 
-def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(tmp_path):
+def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(tmp_path, capsys):
     """A box that a network draws around what it guesses beyond θ_max, and one that is all there."""
-    onnx = pytest.importorskip("onnx")
     lens = lens_of("Equidistant") | {"theta_max": 1.0}  # 88 px around (163, 117)
     table = {
         "inside": [100, 60, 130, 90], "cut": [2, 40, 72, 90], "beyond": [0, 0, 20, 20],
@@ -254,22 +253,12 @@ def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(tmp_path):
     }  # fmt: skip
     rows = np.array([[*box, 0.9 - k / 100, k] for k, box in enumerate(table.values())])
     rows = np.concatenate((rows, [[105, 65, 125, 85, 0.5, 0]]))  # in the first, of its class
-    values = onnx.helper.make_tensor("t", onnx.TensorProto.FLOAT, (1, *rows.shape), rows.ravel())
-    node = onnx.helper.make_node("Constant", [], ["found"], value=values)
-    model = onnx.parser.parse_model("""<ir_version: 8, opset_import: ["" : 18]>
-        network (float[1,3,240,320] images) => (float[1,N,6] found) { found = Neg(images) }""")
-    model.graph.node[0].CopyFrom(node)
-    onnx.save(model, tmp_path / "n.onnx")
+    network = write_constants(tmp_path / "n.onnx", SIZE, found=rows[None].astype(np.float32))
     (tmp_path / "names.json").write_text(json.dumps([*table]))
     write_picture(tmp_path / "p.png", np.zeros((*SIZE, 3), np.uint8))
-    argv = [
-        tmp_path / "p.png",
-        "--network",
-        tmp_path / "n.onnx",
-        "--labels",
-        tmp_path / "names.json",
-    ]
+    argv = [tmp_path / "p.png", "--network", network, "--labels", tmp_path / "names.json"]
     (entry,) = predict(*argv, "--view", "stereographic", out=tmp_path / "out", lens=lens)
+    assert "n.onnx were left out: 2 without an area, and 0 within" in capsys.readouterr().err
     labels = [one["label"] for one in entry["detections"]]
     assert labels == ["inside", "cut", "half outside", "inside"]  # the best first
     kept = dict(zip(labels[:3], entry["detections"], strict=False))
@@ -356,7 +345,19 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --view tangent --fov_deg 180", "--fov_deg .* at most 179.9° for a tang"),
         ("--network n.onnx --fov_deg 400", "--fov_deg must be above 0°"),
         ("--network n.onnx --up 0,0,0", "--up must be three finite numbers"),
-        ("--network n.onnx --mean 123.7", "--mean must be in parts of 255, at most 1, got 123.7"),
+        (
+            "--network n.onnx --mean 123.7",
+            r"--mean must be in parts of 255, at most 1 \(.*\), got 123.7",
+        ),
+        (
+            "--network n.onnx --std 58.395,57.12,57.375",
+            r"--std must be in parts of 255, at most 1 \(.* 0.229,0.224,0.225\), got 58.395",
+        ),
+        (
+            "--network n.onnx --std 255",
+            r"--std must be in parts of 255, at most 1 \(.* this is 1\)",
+        ),
+        ("--network n.onnx --top 2", "--top is for the classes of pictures, but n.onnx is a model"),
         ("--network n.onnx --mean 0.1,0.2", "mean.*per channel"),
         ("--network n.onnx --std 0", "std"),
         ("--network n.onnx --std nan", "--std must be finite, got nan"),
@@ -365,7 +366,7 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network free.onnx", "missing --size: free.onnx takes pictures of any size"),
         ("--network free.onnx --size 0,64", r"--size must be at least 1,1, got \(0, 64\)"),
         (
-            "--network bytes.onnx --std 2",
+            "--network bytes.onnx --std 0.2",
             "bytes.onnx takes pixels of uint8: leave --mean and --std",
         ),
         ("--network n.onnx --threshold nan", "--threshold must be finite, got nan"),
@@ -437,7 +438,11 @@ def test_what_was_found_before_an_error_is_kept(disc, tmp_path):
     net = write_graph(tmp_path / "n.onnx", size=size)
     for network, argv, said in (
         (nan, [], r"no prediction for .*b\.png: .*nan\.onnx computes NaN"),
-        (net, ["--labels", tmp_path / "names.txt"], "found class 1, but --labels has 1 names"),
+        (
+            net,
+            ["--labels", tmp_path / "names.txt"],
+            "found class 1, but --labels has 1 names, from 0 to 0",
+        ),
     ):
         with pytest.raises(SystemExit, match=said):
             run_tiles(tmp_path, network, *argv, picture="in")
@@ -492,3 +497,170 @@ def test_numbers_are_printed_or_written_to_a_file(disc, tmp_path, capsys):
     assert np.array(entry["logits"]).shape == (4, 3) and entry["image"] == str(folder / "p.png")
     main([*argv, "--out", str(tmp_path / "o.json")])
     assert json.loads((tmp_path / "o.json").read_text()) == [entry]
+
+
+def run_constants(folder, *argv, size=(64, 64), view="mercator", **outputs):
+    """What a network with these outputs gives for a picture of 64 × 80 pixels."""
+    network = write_constants(folder / "n.onnx", size, **outputs)
+    write_picture(folder / "p.png", np.zeros((64, 80, 3), np.uint8))
+    lens = {"model": "Equidistant", "focal": 24.0, "image_size": [64, 80], "theta_max": 1.2}
+    argv = [folder / "p.png", "--network", network, "--view", view, *argv]
+    (entry,) = predict(*argv, out=folder / "out", lens=lens)
+    return entry
+
+
+@pytest.mark.parametrize("view", ["mercator", "tiles:4", "square", "panorama"])
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8, np.bool_])
+def test_a_map_of_integers_keeps_its_ids(tmp_path, view, kind):
+    """Of the size of the view, and of a quarter of it without a channel."""
+    count = 4 if view == "tiles:4" else 1
+    ids = np.zeros((1, 1, 64, 64), kind)
+    ids[..., 20:, :], ids[..., 30:, 41:] = (1, 1) if kind is np.bool_ else (10, 3)
+    names = ["x", "y", "z", "three", *"abcdef", "ten"]
+    (tmp_path / "names.json").write_text(json.dumps(names))
+    outputs = dict(whole=ids, quarter=ids[:, 0, ::4, ::4])
+    entry = run_constants(tmp_path, "--labels", tmp_path / "names.json", view=view, **outputs)
+    known = {0, 1} if kind is np.bool_ else {0, 3, 10}
+    assert count == len({*entry} & {"whole"}) * count
+    for output in outputs:
+        found = np.load(tmp_path / "out" / entry[output]["map"])
+        labels = np.asarray(Image.open(tmp_path / "out" / entry[output]["labels"]))
+        assert found.shape == (1, 64, 80) and set(np.unique(found)) == known
+        assert set(np.unique(labels)) == known | {255}
+        shown = labels != 255
+        assert (found[0] == labels)[shown].all() and not found[0][~shown].any()
+        shares = {names[k]: pytest.approx((labels[shown] == k).mean(), abs=1e-6) for k in known}
+        assert entry[output]["shares"] == shares
+
+
+F = np.float32
+HEADS = {f"p{k}": np.zeros((1, 255, 64 // k, 64 // k), F) for k in (8, 16, 32)}
+
+
+@pytest.mark.parametrize(
+    ("outputs", "said"),
+    [
+        (dict(detection_out=np.zeros((1, 1, 100, 7), F)), r"detection_out \(1, 1, 100, 7\); known"),
+        (dict(maps=np.zeros((1, 3, 32, 16), F)), r"maps \(1, 3, 32, 16\); known are .*fraction"),
+        (dict(maps=np.zeros((1, 3, 48, 48), F)), r"maps \(1, 3, 48, 48\); known"),
+        (dict(maps=np.zeros((1, 3, 128, 128), F)), r"maps \(1, 3, 128, 128\); known"),
+        (dict(last=np.zeros((1, 32, 32, 3), F)), r"last \(1, 32, 32, 3\); known"),
+        (dict(table=np.zeros((1, 32, 32), F)), r"table \(1, 32, 32\); known"),
+        (HEADS, r"same channels at several scales, p8 \(255, 8, 8\), .* heads of a detector"),
+    ],
+    ids=str,
+)
+def test_what_is_no_map_is_refused(tmp_path, outputs, said):
+    with pytest.raises(SystemExit, match=said):
+        run_constants(tmp_path, **outputs)
+
+
+def test_maps_at_several_scales_may_be_maps(tmp_path):
+    """A network and its auxiliary output; and one pixel is a number."""
+    entry = run_constants(
+        tmp_path, main=np.zeros((1, 5, 64, 64), F), aux=np.zeros((1, 5, 8, 8), F),
+        pooled=np.arange(3, dtype=F).reshape(1, 3, 1, 1),
+    )  # fmt: skip
+    assert entry["pooled"] == [0, 1, 2]
+    assert all(entry[name]["labels"] for name in ("main", "aux"))
+
+
+CORNERS = np.array([[[8, 10, 30, 40], [40, 5, 60, 22], [20, 30, 50, 60]]], F)
+CENTRES = np.array([[[30, 40, 8, 10], [50, 22, 8, 9], [20, 30, 50, 60]]], F)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "said"),
+    [
+        (CENTRES, r"2 of 3 boxes of .* were left out: 2 without an area, .*centres and sizes"),
+        (CORNERS / 64, r"3 within the first 2 px\. They may be parts of the picture"),
+        (CENTRES / 64, r"3 within the first 2 px\. They may be parts of the picture"),
+        (CORNERS[..., [2, 3, 0, 1]], "3 without an area"),
+        (CORNERS, None),
+    ],
+)
+def test_boxes_that_are_none_are_an_error(tmp_path, capsys, boxes, said):
+    outputs = dict(boxes=boxes, scores=np.full((1, 3), 0.9, F), labels=np.zeros((1, 3), np.int64))
+    if said is None:
+        assert len(run_constants(tmp_path, view="stereographic", **outputs)["detections"]) == 3
+        return
+    with pytest.raises(SystemExit, match=said) as error:
+        run_constants(tmp_path, **outputs)
+    assert error.value.code != 0 and "corners x0, y0, x1, y1 in pixels" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out/predictions.json").read_text())  # what was found is kept
+
+
+PBTXT = """# of TensorFlow
+item { id: 0 name: "/m/01g317" display_name: "person" }
+item {
+  name: 'bicycle'
+  id: 2
+}"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("n.txt", "person\n\nbicycle\n", None),
+        ("n.txt", "\ufeffperson\r\n \r\nbicycle\r\n\r\n", None),
+        ("n.json", '["person", null, "bicycle"]', None),
+        ("n.json", '{"0": "person", "2": "bicycle"}', None),
+        ("config.json", '{"id2label": {"0": "person", "2": "bicycle"}, "x": 1}', None),
+        ("data.yaml", "path: .\nnames: {0: person, 2: bicycle}\nnc: 3", None),
+        ("data.yml", "names: [person, null, bicycle]", None),
+        ("map.pbtxt", PBTXT, None),
+        (
+            "data.yaml",
+            "train: images",
+            "--labels must be a file with the names .*data.yaml: train is no number",
+        ),
+        ("n.json", '{"person": 0}', "person is no number of a class"),
+        ("n.json", "[1, 2]", "1 is no name of class 0"),
+        ("n.json", '{"0": "a", "00": "b"}', "0 appears twice"),
+        ("map.pbtxt", "item { name: 'a' }", "an item has no id: name: 'a'"),
+        ("n.txt", "\n\n", "it has no names; known are a text file with a name in each line"),
+        ("n.txt", "person\n", "found class 2, but --labels has 1 names, from 0 to 0"),
+    ],
+)
+def test_names_of_classes_in_every_form(tmp_path, name, text, said):
+    file = tmp_path / name
+    file.write_text(text, newline="")
+    outputs = dict(boxes=CORNERS[:, :2], scores=np.array([[0.9, 0.8]], F),
+                   labels=np.array([[0, 2]]))  # fmt: skip
+    if said is None:
+        entry = run_constants(tmp_path, "--labels", file, view="stereographic", **outputs)
+        assert [one["label"] for one in entry["detections"]] == ["person", "bicycle"]
+    else:
+        with pytest.raises(SystemExit, match=said):
+            run_constants(tmp_path, "--labels", file, **outputs)
+
+
+def test_the_best_classes_of_a_classifier(tmp_path, capsys):
+    names = tmp_path / "n.txt"
+    names.write_text("cat\ndog\n\ncow\n")
+    logits = np.array([[1.0, 3.0, -9.0, 2.0]], F)
+    shares = np.exp(logits[0]) / np.exp(logits[0]).sum()
+    for values, key, expected in (
+        (logits, "probability", shares), (shares[None], "probability", shares),
+        (np.array([[0.5, 0.9, 0.0, 0.7]], F), "score", [0.5, 0.9, 0.0, 0.7]),
+    ):  # fmt: skip
+        for argv in (["--top", "2"], ["--top", "2", "--labels", names]):
+            entry = run_numbers(tmp_path, *argv, out=values)
+            assert ("gives logits: their softmax" in capsys.readouterr().err) == (values is logits)
+            assert [one["class"] for one in entry["out"]] == (
+                ["dog", "cow"] if "--labels" in argv else [1, 3]
+            )
+            found = [one[key] for one in entry["out"]]
+            assert found == pytest.approx([expected[1], expected[3]], abs=1e-5)
+    assert run_numbers(tmp_path, out=logits)["out"] == logits[0].tolist()
+    with pytest.raises(SystemExit, match=r"--labels names the classes 0 to 3, but .*: 3 in out"):
+        run_numbers(tmp_path, "--labels", names, out=logits[:, :3])
+
+
+def run_numbers(folder, *argv, out):
+    network = write_constants(folder / "n.onnx", (64, 64), out=out)
+    write_picture(folder / "p.png", np.zeros((64, 80, 3), np.uint8))
+    lens = json.dumps({"model": "Equidistant", "focal": 24.0, "theta_max": 1.2})
+    words = [folder / "p.png", "--network", network, "--lens", lens, *argv]
+    main(["predict", *map(str, words), "--out", str(folder / "o.json")])
+    return json.loads((folder / "o.json").read_text())[0]

@@ -60,8 +60,35 @@ def test_what_is_kept_and_where_it_goes(digits, tmp_path, capsys):
         (["--keep", '["stages.7"]'], "the model has no module named stages.7"),
         (["--pictures", "0"], "--pictures must be at least 1, got 0"),
         (["--run", str(tmp_path)], f"no model in {tmp_path}"),
+        (["--run", str(digits / "checkpoints/best.safetensors")], f"belongs to the run {digits}\n"),
+        (["--tolerance", "0"], "every part of the model exceeds the --tolerance 0"),
     ):
         assert message in error(capsys, *given, *more)
+
+
+def test_what_is_wrong_with_the_data_has_the_names_of_the_runs_configuration(digits, capsys):
+    """The command has no options for data. A run without validation is not compared."""
+    config = (digits / "config.yaml").read_text()
+    given = ["quantize", "--run", str(digits), "--pictures", "4"]
+    try:
+        for old, new, said in (
+            ("path: digits", "path: gone", f"the data of {digits}/config.yaml: "),
+            (
+                "camera: null",
+                "camera: front",
+                "data.camera front needs a calibration: give data.lens",
+            ),
+        ):
+            assert old in config
+            (digits / "config.yaml").write_text(config.replace(old, new))
+            assert said in error(capsys, *given)
+        assert "limit_val_batches: null" in config
+        off = config.replace("limit_val_batches: null", "limit_val_batches: 0")
+        (digits / "config.yaml").write_text(off)
+        main(given)
+        assert "no validation pictures to compare" in capsys.readouterr().out
+    finally:
+        (digits / "config.yaml").write_text(config)
 
 
 @pytest.mark.parametrize("task", ["segmentation", "distance"])

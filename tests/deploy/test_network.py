@@ -11,7 +11,7 @@ pytest.importorskip("onnxruntime")
 
 from graphs import DETECTORS, write_graph
 
-from darswin.deploy.network import OnnxNetwork, PartsOfPicture
+from darswin.deploy.network import OnnxNetwork
 
 SIZE = (16, 24)
 # Of three pictures: the box and the channel of its light; the last one is empty.
@@ -177,9 +177,6 @@ def test_wrong_numbers_are_told(tmp_path):
     assert np.isinf(OnnxNetwork(path)(lit)[0].boxes).all()
     path = write_graph(tmp_path / "swapped.onnx", "class before score", size=SIZE)
     with pytest.raises(ValueError, match=r"finds the class 0\.8.*x1, y1, score and class"):
-        OnnxNetwork(path)(lit)
-    path = write_graph(tmp_path / "parts.onnx", "parts", size=SIZE)
-    with pytest.warns(PartsOfPicture, match="multiply them by its width and height"):
         OnnxNetwork(path)(lit)
 
 

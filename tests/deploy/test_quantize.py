@@ -130,7 +130,7 @@ def test_what_disturbs_most_stays_in_float32():
     all_of_it = quantized_layers(quantize_model(model, [seen], tolerance=math.inf))
     some = quantized_layers(quantize_model(model, [seen], tolerance=1e-2))
     assert "stages.1.blocks.0.attn.qkv" in all_of_it.keys() - some.keys()
-    with pytest.raises(ValueError, match=r"exceeds the tolerance 0\.0"):
+    with pytest.raises(ValueError, match=r"exceeds the `tolerance` 0\.0"):
         quantize_model(model, [seen], tolerance=0.0)
 
 

@@ -7,12 +7,11 @@ from lens_examples import ASIDE
 from darswin.lens import Equidistant, Perspective, Polynomial, Spherical
 from darswin.lens.concentric import (
     disc_to_square,
-    square_pixels,
     square_points,
     square_to_disc,
     square_view,
 )
-from darswin.lens.pixels import OUTSIDE, sample_at
+from darswin.lens.pixels import OUTSIDE
 from darswin.lens.spacing import SPACINGS
 
 f64 = torch.float64
@@ -126,20 +125,3 @@ def test_tan_ends_before_90_degrees():
         with pytest.raises(ValueError, match="spacing='tan' needs lenses with θ_max below 90°"):
             function(Equidistant(4.0, 1.6))
         assert function(Perspective(4.0, 1.2)).isfinite().all()
-
-
-def test_reading_a_square_of_any_resolution():
-    """A linear function of the place is read exactly, up to the outermost pixels."""
-    places = torch.rand(2, 7, 5, 2) * 1.6 - 0.8
-    places[0, 0, 0] = OUTSIDE
-    for size in (8, 13):
-        steps = (2 * torch.arange(size) + 1) / size - 1
-        a, b = torch.meshgrid(steps, steps, indexing="xy")
-        square = torch.stack((a, b, 1 + 0 * a)).expand(2, -1, -1, -1)
-        read = sample_at(square, square_pixels(places, (size, size)))
-        expected = torch.cat((places, torch.ones(2, 7, 5, 1)), -1).permute(0, 3, 1, 2).clone()
-        expected[0, :, 0, 0] = 0
-        torch.testing.assert_close(read, expected)
-    corners = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]).reshape(1, 1, 2, 2)
-    read = sample_at(torch.arange(16.0).reshape(1, 1, 4, 4), square_pixels(corners, (4, 4)))
-    assert read.flatten().tolist() == [0.0, 15.0]  # the rim does not fade to 0

@@ -16,18 +16,22 @@ from darswin.train.distance import Distance, DistanceData
 from darswin.train.pixel_task import Rays
 from darswin.train.results import tables
 from darswin.train.segmentation import AbsentClass, LabelData, Segmentation
+from darswin.views import Prepared
 
 NAME = "darswin_unet_a_nano"
 
 
 class Constant(torch.nn.Module):
-    """A network with the same output for all images."""
+    """A network with the same output for all images, behind a view that shows a part of them."""
 
-    def __init__(self, output):
+    def __init__(self, output, shown=None):
         super().__init__()
-        self.output = torch.nn.Parameter(output)
+        self.output, self.shown = torch.nn.Parameter(output), shown
 
-    def forward(self, images, lens):
+    def prepare(self, lens, size):
+        return Prepared(size, None, shown=self.shown)
+
+    def run(self, images, prepared):
         return self.output
 
 
@@ -69,7 +73,9 @@ def test_answers_for_pixels_that_do_not_count_change_nothing(folder, kind, made,
     _, lens, target = batch
     task = attached(kind(NAME, **options), data)
     task._make_metrics()
-    unknown = ~task._known(target)
+    shown = torch.arange(32).expand(1, 32, 32) >= 9
+    asked = task._known(target)
+    unknown = ~(asked & shown)
     beyond = pixel_angles(lens, (32, 32)).isnan()
     assert beyond.any() and unknown[beyond].all() and not unknown.all()
     if options.get("ignore_index") or of_data:
@@ -79,12 +85,12 @@ def test_answers_for_pixels_that_do_not_count_change_nothing(folder, kind, made,
     other = torch.where(unknown[:, None], 1 + 5 * torch.rand(shape), output)
     found = []
     for values in (output, other):
-        task.net = Constant(values)
+        task.net = Constant(values, shown)
         loss = task._loss(batch, None)
         loss.backward()
         assert not task.net.output.grad[unknown[:, None].expand(shape)].any()
         measured = task.test_metrics[0]
-        for metric in (measured.sums, measured.loss, measured.images):
+        for metric in (measured.sums, measured.loss, measured.images, measured.asked):
             metric.reset()
         with torch.no_grad():
             task.test_step(batch, 1)
@@ -94,6 +100,8 @@ def test_answers_for_pixels_that_do_not_count_change_nothing(folder, kind, made,
     (row,) = task.results
     assert row["n"] == 4
     assert row["pixels"] == (~unknown).sum() == sum(zone["pixels"] for zone in row["per_zone"])
+    assert row["unanswered"] == pytest.approx(((asked & ~shown).sum() / asked.sum()).item())
+    assert row["unanswered"] > 0.1
     if kind is Segmentation:
         left = {"sky", "ground", "wall"} - ({"ground"} if options.get("ignore_index") else set())
         assert set(row["per_class"]) == left

@@ -193,7 +193,7 @@ def test_the_convolutional_unet_sees_pixels_and_rays_of_every_view(name, kind):
     images = torch.rand(lens.count, 3, *SIZE)
     prepared = model.prepare(lens, SIZE)
     logits = plain.eval()(torch.cat((model.view.see(images, prepared), prepared.rays), 1))
-    expected = model.head.finish(model.view.back(logits, prepared))
+    expected = model.head.finish(model.view.back(logits, prepared), prepared.shown)
     assert torch.equal(model(images, lens), expected)
     assert expected.shape == (lens.count, 1, *SIZE) and expected.std() > 0
     assert torch.equal(model.run_sampled(model.sample(images, prepared), prepared), expected)

@@ -270,7 +270,12 @@ def test_undistorted_it_predicts_in_the_view_and_brings_back():
     half = torch.full((2,), 1.0)  # the view shows 2.0 rad of the 2.6 rad
     view = Perspective(32 / torch.tan(half), half)
     logits = plain(reproject(images, WIDE, view, (64, 64)))
-    torch.testing.assert_close(undis(images, WIDE), reproject(logits, view, WIDE, (64, 64)))
+    found, inner = (
+        reproject(maps, view, WIDE, (64, 64)) for maps in (logits, torch.ones_like(logits))
+    )
+    whole = inner > 0.9999  # beside its border, where a map that is sampled mixes with 0
+    torch.testing.assert_close(undis(images, WIDE)[whole], found[whole], rtol=1e-4, atol=1e-4)
+    assert whole.float().mean() > 0.3
     theta, _ = WIDE.unproject_pixels(torch.tensor([[[0.0, 32.0]]]), (64, 64))
     assert (theta > 1.0).all() and (undis(images, WIDE)[:, :, 32, 0] == 0).all()
 
