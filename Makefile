@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-numerics test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-numerics test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -111,9 +111,6 @@ fuzz: build  ## call the operators with random and hostile arguments, and read 1
 
 kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py
-
-mutants: build  ## change single places of the code and count the changes that tests notice (hours; can be interrupted)
-	PATH=$(ROOT)/$(BIN):$$PATH $(BIN)/python tests/mutants.py
 
 lint: $(STAMP)  ## check the code with ruff, mypy and clang-format
 	$(BIN)/ruff check .
