@@ -41,6 +41,7 @@ def _shares(count: int) -> np.ndarray:
 _ELLIPSE = _shares(_COUNT)
 _STEP = 4.0  # px: a curve differs less than 0.1 px from its chords, if its radius is above 20 px
 _INNER = np.linspace(0, 1, 4)[:, None, None]  # radii of points inside an ellipse
+_MOST_POINTS = 100_000  # of a polygon: a corner that is far away must not fill the memory
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
 
@@ -117,6 +118,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
         raise ValueError(f"step must be above 0 px, got {step}")
     sides = np.roll(polygon, -1, 0) - polygon
     lengths = np.nan_to_num(np.hypot(*sides.T), posinf=0)  # a side to nowhere stays as it is
+    step = max(step, lengths.sum() / _MOST_POINTS)
     pieces = np.maximum(np.ceil(lengths / step), 1).astype(int)
     side = np.repeat(np.arange(len(polygon)), pieces)
     piece = np.arange(len(side)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

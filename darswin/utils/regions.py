@@ -18,7 +18,9 @@ _RAYS = 360
 _TURN = np.linspace(-np.pi, np.pi, _RAYS, endpoint=False)
 _GRID = np.stack(np.meshgrid(*[(np.arange(16) + 0.5) / 16] * 2), -1).reshape(-1, 2)
 _SAME = 1e-3  # rad, or px at a border: places that differ by rounding
-_LEAP = 8  # neighbours that are nearer than this part of a thing are not beside a seam by chance
+# Points of a thing have a seam between them if they are far from each other in the new picture, and
+# nearer than this part of the thing in the old one.
+_NEAR = 1 / 3
 
 
 class Part(NamedTuple):
@@ -219,7 +221,7 @@ def _in_one_place(parts: list[Part], width: int) -> list[Part]:
     pieces, jumped = [], False
     for old, new in parts:
         leaps = np.abs(np.roll(new[:, 0], -1) - new[:, 0]) > width / 2
-        near = np.abs(np.roll(old, -1, 0) - old).max(1) * _LEAP < np.ptp(old, axis=0).max()
+        near = np.abs(np.roll(old, -1, 0) - old).max(1) < _NEAR * np.ptp(old, axis=0).max()
         places = np.flatnonzero(leaps & near)
         if not len(places):
             pieces.append(Part(old, new))
