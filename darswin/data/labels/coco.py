@@ -231,8 +231,10 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
     segments = annotation.get("segmentation") or ()
     polygons, rle, mask = [], None, np.zeros(size, bool)
     if isinstance(segments, Mapping):
-        rle = segments
-        if "size" in rle and list(map(_side, np.ravel(rle["size"]))) not in ([None], list(size)):
+        rle = dict(segments)
+        if (sides := list(map(_side, np.ravel(rle.get("size"))))) == list(size):
+            rle["size"] = sides  # which may have been texts
+        elif len(sides) == 2:
             raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")
         try:
             mask = decode_rle(rle)
