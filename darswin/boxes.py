@@ -11,10 +11,13 @@ the corners are mostly empty, so a rectangle would grow with every step.
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from darswin.utils.regions import box_of, shown_parts
+from darswin.utils.run_lengths import checked_runs, to_text
 
 __all__ = [
     "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "decode_rle", "encode_rle",
@@ -24,43 +27,69 @@ __all__ = [
 Array = Any  # a NumPy array, a tensor, or lists of numbers
 PointMap = Callable[[np.ndarray], np.ndarray]
 
-_ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-# The points of the ellipse inside a box are the product of the box and this matrix, (4, 144).
-_SHARES = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), -1)[..., None] / 2 + 0.5
-_ELLIPSE = np.concatenate(((1 - _SHARES) * np.eye(2), _SHARES * np.eye(2)), -1).reshape(144, 4).T
+_COUNT, _FINELY = 72, 288  # points of an ellipse, and of one that is cut
+
+
+def _shares(count: int) -> np.ndarray:
+    """The points of the ellipse inside a box are the product of the box and this, (4, 2·count)."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    shares = np.stack((np.cos(angles), np.sin(angles)), -1)[..., None] / 2 + 0.5
+    both = np.concatenate(((1 - shares) * np.eye(2), shares * np.eye(2)), -1)
+    return both.reshape(2 * count, 4).T
+
+
+_ELLIPSE = _shares(_COUNT)
 _STEP = 4.0  # px: a curve differs less than 0.1 px from its chords, if its radius is above 20 px
+_INNER = np.linspace(0, 1, 4)[:, None, None]  # radii of points inside an ellipse
+_MOST_POINTS = 100_000  # of a polygon: a corner that is far away must not fill the memory
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
 
 # -- through a map of points --------------------------------------------------------------------
 
 
-def carry(boxes: Array, points_map: PointMap) -> tuple[Any, Any]:
+def carry(
+    boxes: Array, points_map: PointMap, size: tuple[int, int] | None = None
+) -> tuple[Any, Any]:
     """Carries boxes through a point map, by the ellipses inside them.
 
+    The ellipse of a thing that is seen in part ends where the map does, and at the borders of the
+    new picture. Its new box is that of what is left.
+
     Args:
-        boxes: (K, 4). points_map: called once, with points (K, 72, 2).
+        boxes: (K, 4).
+        points_map: called once with points (K, 72, 2), and more often if boxes are cut.
+        size: (H, W) of the new picture. Without it, boxes may go on beyond the picture.
 
     Returns:
-        The boxes of the points that are seen, (K, 4), NaN if none is; and the visible shares of the
-        points, (K,), 0 to 1.
+        The boxes of what is seen, (K, 4), NaN if nothing is; and the visible shares of the areas of
+        the ellipses, (K,), 0 to 1.
 
     Raises:
         ValueError: boxes of another shape.
     """
+    table = _table(boxes)
     # Reductions along a contiguous axis are several times as fast.
-    found = np.ascontiguousarray(np.moveaxis(_through(points_map, ellipses(boxes)), -1, 0))
-    unseen = np.isnan(found)
-    low, high = np.where(unseen, np.inf, found).min(2), np.where(unseen, -np.inf, found).max(2)
-    visible = 1 - unseen[0].mean(1)
-    carried = np.where(visible[:, None] > 0, np.concatenate((low, high)).T, np.nan)
+    x, y = np.ascontiguousarray(np.moveaxis(_through(points_map, ellipses(table)), -1, 0))
+    carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1) if len(table) else table
+    whole = ~np.isnan(carried[:, 0])
+    if size is not None:
+        whole &= (clip(carried, size) == carried).all(1)
+        whole &= (np.abs(np.diff(x, append=x[:, :1])) <= size[1] / 2).all(1)  # not at a seam
+    visible = np.ones(len(table))
+    cut = np.flatnonzero(~whole)
+    outlines = [*ellipses(table[cut], _FINELY)]
+    shown = shown_parts(outlines, lambda points: _through(points_map, points), size)
+    for k, (parts, share) in zip(cut, shown, strict=True):
+        carried[k], visible[k] = box_of([part.new for part in parts]), share
     return _like(boxes, carried), _like(boxes, visible)
 
 
-def ellipses(boxes: Array) -> np.ndarray:
-    """The points of the ellipses inside boxes, (K, 72, 2); NaN for boxes that are not finite."""
+def ellipses(boxes: Array, count: int = _COUNT) -> np.ndarray:
+    """Points of the ellipses inside boxes, (K, count, 2); NaN for boxes that are not finite."""
     table = _table(boxes)
-    return (np.where(np.isfinite(table), table, np.nan) @ _ELLIPSE).reshape(-1, 72, 2)
+    shares = _ELLIPSE if count == _COUNT else _shares(count)
+    return (np.where(np.isfinite(table), table, np.nan) @ shares).reshape(-1, count, 2)
 
 
 def carry_points(points: Array, points_map: PointMap) -> Any:
@@ -89,6 +118,7 @@ def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:
         raise ValueError(f"step must be above 0 px, got {step}")
     sides = np.roll(polygon, -1, 0) - polygon
     lengths = np.nan_to_num(np.hypot(*sides.T), posinf=0)  # a side to nowhere stays as it is
+    step = max(step, lengths.sum() / _MOST_POINTS)
     pieces = np.maximum(np.ceil(lengths / step), 1).astype(int)
     side = np.repeat(np.arange(len(polygon)), pieces)
     piece = np.arange(len(side)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -203,34 +233,60 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
 
     Args:
         to_rays: a function from points (..., 2), in darswin's pixels, to rays (..., 3), NaN or 0
-            where nothing is seen. Only the seen points count; without any, all is NaN.
+            where nothing is seen. Boxes end there, as those of `carry`; without any ray, all is
+            NaN.
 
     Returns:
         A named tuple of the boxes as a camera sees them that looks at their middles, level with the
         camera's frame: azimuth and elevation of the middles (K,) rad, to the right and up from the
-        optical axis; width and height (K,) rad, the horizontal and the vertical angle of view; ray
-        (K, 3), the unit vectors of the middles in the camera's frame (x right, y down, z forward);
-        and solid_angle (K,) sr, of the rectangle in that view.
+        optical axis; width and height (K,) rad, the horizontal and the vertical angle of view, 0 to
+        2π; ray (K, 3), the unit vectors of the middles in the camera's frame (x right, y down, z
+        forward); and solid_angle (K,) sr, of the rectangle in that view, NaN if width or height is
+        above π, because no rectangle has them.
     """
-    rays = np.asarray(to_rays(ellipses(boxes) - 0.5), np.float64)
-    length = np.linalg.norm(rays, axis=-1, keepdims=True)
-    rays = np.divide(rays, length, out=np.full(rays.shape, np.nan), where=length > 0)
-    ray = np.nan_to_num(rays).sum(1)
+
+    def to_units(points: np.ndarray) -> np.ndarray:
+        rays = np.asarray(to_rays(points - 0.5), np.float64)
+        length = np.linalg.norm(rays, axis=-1, keepdims=True)
+        return np.divide(rays, length, out=np.full(rays.shape, np.nan), where=length > 0)
+
+    table = _table(boxes)
+    rays = to_units(ellipses(table))
+    inner = ellipses(table, 12)[:, None]  # a mean of outlines beyond 90° would look backwards
+    inner = inner.mean(2, keepdims=True) * (1 - _INNER) + inner * _INNER
+    ray = np.nan_to_num(to_units(inner.reshape(len(table), 48, 2))).sum(1)
+    cut = np.flatnonzero(np.isnan(rays).any((1, 2)))
+    if len(cut):
+        found = [
+            np.concatenate([np.zeros((0, 3)), *(part.new for part in parts)])
+            for parts, _ in shown_parts([*ellipses(table[cut], _FINELY)], to_units)
+        ]
+        most = max(rays.shape[1], *map(len, found))
+        rays = np.pad(rays, ((0, 0), (0, most - rays.shape[1]), (0, 0)), constant_values=np.nan)
+        for k, of_box in zip(cut, found, strict=True):
+            rays[k, : len(of_box)], rays[k, len(of_box) :] = of_box, np.nan
+            if not ray[k].any():
+                ray[k] = of_box.sum(0)
     ray[np.isnan(rays).all((1, 2))] = np.nan
-    for _ in range(4):  # each turn halves the digits that the middle lacks
+    for _ in range(8):  # each turn halves the digits that the middle lacks
         azimuth = np.arctan2(ray[:, 0], ray[:, 2])
         elevation = np.arctan2(-ray[:, 1], np.hypot(ray[:, 0], ray[:, 2]))
         frame = _looking(azimuth, elevation)
         x, y, z = np.moveaxis(rays @ frame.mT, -1, 0)
-        across, down = np.arctan2(x, z), np.arctan2(y, z)
+        aside = np.hypot(x, y)
+        # θ, along the direction from the middle: good for angles beyond 90°.
+        scale = np.divide(np.arctan2(aside, z), aside, out=np.ones(x.shape), where=aside > 0)
+        across, down = x * scale, y * scale
         low = np.stack((np.fmin.reduce(across, axis=1), np.fmin.reduce(down, axis=1)))
         high = np.stack((np.fmax.reduce(across, axis=1), np.fmax.reduce(down, axis=1)))
-        (sin_u, sin_v), (cos_u, cos_v) = np.sin((low + high) / 2), np.cos((low + high) / 2)
-        middle = np.stack((sin_u * cos_v, cos_u * sin_v, cos_u * cos_v), -1)
-        ray = (middle[:, None] @ frame)[:, 0]
+        u, v = (low + high) / 2
+        theta = np.hypot(u, v)
+        aside = np.sinc(theta / np.pi)  # sin θ / θ
+        ray = (np.stack((u * aside, v * aside, np.cos(theta)), -1)[:, None] @ frame)[:, 0]
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     width, height = high - low
     solid = 4 * np.arcsin(np.sin(width / 2) * np.sin(height / 2))
+    solid[(width > np.pi) | (height > np.pi)] = np.nan
     found = (azimuth, elevation, width, height, ray, solid)
     return SphericalBoxes(*(_like(boxes, value) for value in found))
 
@@ -261,60 +317,21 @@ def encode_rle(mask: Array, *, compressed: bool = True) -> dict[str, Any]:
     counts = np.diff(changes, prepend=0, append=flat.size).tolist()
     counts = [0] * bool(flat.size and flat[0]) + counts
     size = list(pixels.shape)
-    return {"size": size, "counts": _to_text(counts) if compressed else counts}
+    return {"size": size, "counts": to_text(counts) if compressed else counts}
 
 
 def decode_rle(rle: Mapping[str, Any]) -> np.ndarray:
     """The mask (H, W), bool, of COCO's run-length encoding, compressed or not.
 
     Raises:
-        ValueError: size or counts are missing, or runs do not fill the mask.
+        ValueError: size or counts are missing or wrong, or runs do not fill the mask.
     """
     try:
-        (height, width), counts = rle["size"], rle["counts"]
-    except (KeyError, TypeError, ValueError) as error:
+        size, counts = rle["size"], rle["counts"]
+    except (KeyError, TypeError) as error:
         raise ValueError("a run-length encoding must have a size [H, W] and counts") from error
-    if isinstance(counts, bytes):
-        counts = counts.decode("ascii")
-    runs = np.asarray(_from_text(counts) if isinstance(counts, str) else counts, np.int64)
-    if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
-        raise ValueError(
-            f"the counts of a run-length encoding of {height} × {width} px must be at least 0 and "
-            f"have the sum {height * width}, got {runs.sum()}"
-        )
+    height, width, runs = checked_runs(size, counts)
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape((height, width), order="F")
-
-
-def _to_text(counts: Sequence[int]) -> str:
-    """Counts as differences to the count before the last, in groups of 5 bits, lowest first."""
-    text = []
-    for place, count in enumerate(counts):
-        value = count - counts[place - 2] if place > 2 else count
-        while True:
-            bits, value = value & 31, value >> 5
-            more = value != (-1 if bits & 16 else 0)
-            text.append(chr(48 + bits + 32 * more))
-            if not more:
-                break
-    return "".join(text)
-
-
-def _from_text(text: str) -> list[int]:
-    counts: list[int] = []
-    value = shift = 0
-    for character in text:
-        bits = ord(character) - 48
-        if not 0 <= bits < 64:
-            raise ValueError(f"a run-length encoding must not contain {character!r}")
-        value |= (bits & 31) << shift
-        shift += 5
-        if not bits & 32:
-            value -= (1 << shift) * bool(bits & 16)
-            counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-            value = shift = 0
-    if shift:
-        raise ValueError("a run-length encoding ends within a number")
-    return counts
 
 
 # -- arrays ---------------------------------------------------------------------------------------

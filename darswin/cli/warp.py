@@ -23,7 +23,7 @@ from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
 from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Move, move_things
-from darswin.data.labels.yolo import is_yolo
+from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.data.reframing import Warped
 from darswin.data.warping import picture_size
 from darswin.lens import Lens, save, to_dict
@@ -59,12 +59,13 @@ def warp(
 
     Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. Things
     of which less than a fifth is visible in the new picture are left out and listed in left.json.
-    The same command goes on where an earlier run was stopped. Pictures that cannot be read are
-    named at the end; all others are written.
+    The same command goes on where an earlier run was stopped. Pictures and labels that cannot be
+    read are named at the end; all others are written.
 
     Args:
-        source: a COCO file of instances or keypoints; or a folder in the form of YOLO, or of
-            WoodScape with its boxes.
+        source: a COCO file of instances or keypoints, or its folder; a folder in the form of YOLO
+            or its data.yaml; or a folder of WoodScape with its boxes. Oriented boxes of YOLO are
+            outlines with four corners, and become outlines with many.
         to: the calibration file of the new camera, or its lens as JSON, see --lens; or a view, such
             as mercator or tiles:5, with the number of tiles.
         out: the folder to write to: new, empty, or from an earlier run of the same command. It gets
@@ -103,6 +104,7 @@ def warp(
             "name them relative to their folder"
         )
     in_yolo = is_yolo(Path(source))
+    _check_names(data, 1 if isinstance(target, Lens) else target.count, in_yolo)
     settings = dict(
         source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
         camera=camera, coefficients=coefficients, pictures=os.path.abspath(data.folder),
@@ -117,7 +119,19 @@ def warp(
         for one in each(data.files, data.raw):
             found.append(one)
             progress.done += 1
-    _write(folder, data, target, found, in_yolo, settings)
+    _write(folder, data, target, found, settings | {"yolo": source if in_yolo else None})
+
+
+class _Left(NamedTuple):
+    """A thing of which too little is visible: its share in each new picture."""
+
+    thing: Thing
+    shares: Sequence[float]
+
+    @property
+    def fits_no_tile(self) -> bool:
+        """Whether the tiles show enough of it only together."""
+        return sum(self.shares) >= LEAST_VISIBLE
 
 
 class _Warped(NamedTuple):
@@ -125,9 +139,10 @@ class _Warped(NamedTuple):
     that took it, as JSON; or an error."""
 
     pictures: Sequence[tuple[str, Labels]] = ()
-    left: Sequence[Thing] = ()
+    left: Sequence[_Left] = ()
     lens: str = ""
     error: str = ""
+    wrong: Sequence[str] = ()  # things that cannot be read
 
 
 class _InView:
@@ -194,11 +209,9 @@ class _Work:
         assert self.data.lenses is not None
         name = self.data.folder / file
         header = read_header(name)
-        labels = self.data.read(raw, header.upright)
+        labels, wrong = self.data.read(raw, header.upright)
         maps = self._maps_of(self.data.lenses.lens_of(name, header.upright, header.orientation))
-        new = written_as(Path(file))
-        tiles = [f"_{k}" for k in range(len(maps.moves))] if len(maps.moves) > 1 else [""]
-        files = [str(new.with_stem(new.stem + tile)) for tile in tiles]
+        files = _new_names(file, len(maps.moves))
         if not all((self.folder / file).is_file() for file in files):
             image, orientation = read_oriented(name, header.channels)
             if (image.shape[:2], orientation) != (header.upright, header.orientation):
@@ -209,14 +222,15 @@ class _Work:
                 write_image(self.folder / file, picture)
         moved = [move_things(labels.things, move) for move in maps.moves]
         left = [
-            thing for thing, *tiles in zip(labels.things, *moved, strict=True)
-            if all(found is None for found in tiles)
-        ]  # fmt: skip
+            _Left(thing, [one.visible for one in tiles])
+            for thing, *tiles in zip(labels.things, *moved, strict=True)
+            if all(one.visible < LEAST_VISIBLE for one in tiles)
+        ]
         shown = [
-            Labels([thing for thing in things if thing is not None], move.size)
+            Labels([thing for thing in things if thing.visible >= LEAST_VISIBLE], move.size)
             for things, move in zip(moved, maps.moves, strict=True)
         ]
-        return _Warped([*zip(files, shown, strict=True)], left, maps.said)
+        return _Warped([*zip(files, shown, strict=True)], left, maps.said, wrong=wrong)
 
     def _maps_of(self, lens: Lens) -> _Maps:
         if id(lens) not in self.maps:
@@ -224,6 +238,24 @@ class _Work:
                 del self.maps[next(iter(self.maps))]
             self.maps[id(lens)] = _Maps(lens, self.target)
         return self.maps[id(lens)]  # it keeps the lens, and so its identity
+
+
+def _new_names(file: str, count: int) -> list[str]:
+    """The names of the new pictures of a picture."""
+    new = written_as(Path(file))
+    tiles = [f"_{k}" for k in range(count)] if count > 1 else [""]
+    return [str(new.with_stem(new.stem + tile)) for tile in tiles]
+
+
+def _check_names(data: LabelledPictures, count: int, in_yolo: bool) -> None:
+    """ValueError if two pictures or their labels would be one file."""
+    taken: dict[str, str] = {}
+    for file in data.files:
+        for name in _new_names(file, count):
+            key = os.path.normpath(name)
+            key = os.path.splitext(key)[0] if in_yolo else key
+            if (other := taken.setdefault(key, file)) != file:
+                raise ValueError(f"{other} and {file} would both become {name}: rename one of them")
 
 
 @contextmanager
@@ -301,7 +333,7 @@ def _claim(out: str, settings: dict[str, Any]) -> Path:
 
 def _write(
     folder: Path, data: LabelledPictures, target: Lens | PixelView, found: Sequence[_Warped],
-    in_yolo: bool, settings: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> None:  # fmt: skip
     """Writes the labels, the new camera or view, and the report, and prints it."""
     entries = data.entries or [{}] * len(data)
@@ -310,8 +342,15 @@ def _write(
         for name, entry, one in zip(data.files, entries, found, strict=True)
         for file, labels in one.pictures
     ]
-    if in_yolo:
-        write_yolo(folder, pictures, data.categories)
+    if settings["yolo"] is not None:
+        new_names = {
+            os.path.normpath(name): [file for file, _ in one.pictures]
+            for name, one in zip(data.files, found, strict=True)
+        }
+        entries, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
+        write_yolo(folder, pictures, data.categories, entries)
+        for split in missing:
+            print(f"left out of data.yaml, because it is not in {data.folder}: {split}")
     else:
         write_coco(folder / COCO, pictures, data.categories)
     if isinstance(target, Lens):
@@ -323,20 +362,37 @@ def _write(
         replace_file(folder / VIEW, json.dumps(view, indent=1))
     names = {category["id"]: category["name"] for category in data.categories}
     left = [
-        {"file": name, "id": thing.more.get("id"), "category": names[thing.category]}
+        {
+            "file": name, "id": lost.thing.more.get("id"), "category": names[lost.thing.category],
+            "visible": round(max(lost.shares), 3), "fits_no_tile": lost.fits_no_tile,
+        }
         for name, one in zip(data.files, found, strict=True)
-        for thing in one.left
-    ]
+        for lost in one.left
+    ]  # fmt: skip
     replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
     bad = [one.error for one in found if one.error]
+    wrong = [*data.wrong, *(text for one in found for text in one.wrong)]
     things = sum(len(labels.things) for _, labels in pictures)
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {things} things")
-    if left:
+    large = sum(lost["fits_no_tile"] for lost in left)
+    listed = f"{folder / LEFT} lists them"
+    if len(left) > large:
         print(
-            f"{len(left)} things have left the picture, because less than {LEAST_VISIBLE:.0%} of "
-            f"them is visible; {folder / LEFT} lists them"
+            f"{len(left) - large} things have left the picture, because less than "
+            f"{LEAST_VISIBLE:.0%} of them is visible; {listed}"
         )
-    if bad:
-        more = [f"and {len(bad) - _NAMED} more"] * (len(bad) > _NAMED)
-        said = "\n".join([*bad[:_NAMED], *more])
-        raise BrokenImageError(f"{len(bad)} of {len(data)} pictures were left out:\n{said}")
+    if large:
+        print(
+            f"{large} things are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of them, "
+            f"only several together; {listed}"
+        )
+    said = []
+    for texts, what in (
+        (bad, f"{len(bad)} of {len(data)} pictures were left out"),
+        (wrong, f"{len(wrong)} pictures and annotations of the labels were left out"),
+    ):
+        if texts:
+            more = [f"and {len(texts) - _NAMED} more"] * (len(texts) > _NAMED)
+            said += [f"{what}:", *texts[:_NAMED], *more]
+    if said:
+        raise BrokenImageError("\n".join(said))

@@ -13,6 +13,7 @@ import os
 import reprlib
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing, bo
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
+from darswin.utils.regions import NO_AREA, area_of, box_of
 from darswin.utils.text import read_json
 
 _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",
         "visible"}  # fmt: skip
 _DIGITS = 3  # after the point, in pixels
+_FAR = 100  # times the longer side of a picture: no thing reaches that far
 
 
 def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
@@ -38,9 +41,9 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         pictures: the folder to which `file_name` is relative, if it is in none of the usual places.
 
     Raises:
-        FileNotFoundError: a missing file or missing pictures.
-        ValueError: another form, unknown pictures or categories, or numbers that are not finite.
-            All errors name the file.
+        FileNotFoundError: a missing file, or no pictures where they should be.
+        ValueError: another form. All errors name the file. Single pictures and annotations that
+            cannot be used are left out and named in `wrong`, or by `labels(k)`.
     """
     path = Path(path)
     content = read_json(path)
@@ -57,18 +60,10 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         }
         if nameless := [category for category in categories if "name" not in category]:
             raise ValueError(f"{path}: a category must have a name, got {nameless[0]}")
-        for annotation in content["annotations"]:
-            if (category := annotation["category_id"]) not in mirrors:
-                raise ValueError(
-                    f"{path}: the annotation {annotation.get('id')} has the category {category!r}, "
-                    f"but the categories are {some(list(mirrors))}"
-                )
-            if (picture := annotation["image_id"]) not in of_picture:
-                raise ValueError(
-                    f"{path}: the annotation {annotation.get('id')} is of the picture {picture!r}, "
-                    "which the file does not list"
-                )
-            of_picture[picture].append(annotation)
+        wrong = [
+            f"{path}: {said}" for annotation in content["annotations"]
+            if (said := _placed(annotation, of_picture, mirrors))
+        ]  # fmt: skip
     except KeyError as error:
         raise ValueError(f"{path} is not in COCO's form: it lacks {error}") from error
     except (AttributeError, TypeError) as error:
@@ -76,17 +71,48 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
     if len(of_picture) < len(entries) or len(set(files)) < len(files):
         raise ValueError(f"{path} lists a picture twice")
     folder = Path(pictures) if pictures is not None else _folder(path, files)
-    if missing := [file for file in files if not (folder / file).is_file()]:
-        raise FileNotFoundError(
-            f"{len(missing)} of {len(files)} pictures of {path} are not in {folder}: "
-            f"{some(missing)}"
-        )
+    there = [(folder / file).is_file() for file in files]
+    if missing := [file for file, is_there in zip(files, there, strict=True) if not is_there]:
+        text = f"{len(missing)} of {len(files)} pictures of {path} are not in {folder}"
+        if len(missing) == len(files):
+            raise FileNotFoundError(f"{text}: {some(missing)}")
+        wrong += [f"{path}: there is no picture {file} in {folder}" for file in missing]
     calibration = calibration_in(path.parent, path.parent.parent)
+    entries = list(compress(entries, there))
     return LabelledPictures(
-        folder, files, [(entry, of_picture[entry["id"]]) for entry in entries],
+        folder, list(compress(files, there)),
+        [(entry, of_picture[entry["id"]]) for entry in entries],
         partial(_labels, path=str(path), mirrors=mirrors), categories, entries,
-        Calibrations(calibration, folder) if calibration else None,
+        Calibrations(calibration, folder) if calibration else None, wrong,
     )  # fmt: skip
+
+
+def coco_files(folder: Path) -> list[Path]:
+    """The COCO files of instances or keypoints of a folder: in it, or in `annotations/`."""
+    return [
+        file for file in sorted((*folder.glob("*.json"), *folder.glob("annotations/*.json")))
+        if b'"annotations"' in (text := file.read_bytes()) and b'"categories"' in text
+    ]  # fmt: skip
+
+
+def _placed(
+    annotation: Any, of_picture: Mapping[Any, list[dict]], categories: Mapping[Any, Any]
+) -> str | None:
+    """Adds an annotation to those of its picture, or says why this cannot be."""
+    try:
+        name = f"the annotation {annotation.get('id')}"
+        category, picture = annotation["category_id"], annotation["image_id"]
+        if category not in categories:
+            known = some(list(categories))
+            return f"{name} has the category {category!r}, but the categories are {known}"
+        if picture not in of_picture:
+            return f"{name} is of the picture {picture!r}, which the file does not list"
+    except KeyError as error:
+        return f"{name} lacks {error}"
+    except (AttributeError, TypeError):
+        return f"an annotation must be a JSON object with ids, got {reprlib.repr(annotation)}"
+    of_picture[picture].append(annotation)
+    return None
 
 
 def write_coco(
@@ -133,6 +159,9 @@ def _annotation(thing: Thing) -> dict[str, Any]:
         "iscrowd": int(thing.crowd),
         "visible": round(thing.visible, _DIGITS),
     }
+    if thing.turn:
+        turned = {"rotation": math.degrees(thing.turn)}
+        found["attributes"] = {**(thing.more.get("attributes") or {}), **turned}
     if thing.rle is not None:
         found["segmentation"] = thing.rle
     elif len(thing.polygons):
@@ -160,20 +189,30 @@ def _folder(path: Path, files: Sequence[str]) -> Path:
 
 def _labels(
     raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, mirrors: Mapping
-) -> Labels:
+) -> tuple[Labels, list[str]]:
     entry, annotations = raw
-    if (said := (entry.get("height"), entry.get("width"))) not in (size, (None, None)):
+    said = tuple(map(_side, (entry.get("height"), entry.get("width"))))
+    if said not in (size, (None, None)):
+        turned = " when its EXIF orientation turns it upright, as labels need it"
         raise ValueError(
             f"{path} says that {entry['file_name']} has {said[1]} × {said[0]} px, but it has "
-            f"{size[1]} × {size[0]}"
+            f"{size[1]} × {size[0]}{turned if said == size[::-1] else ''}"
         )
-    things = []
+    things, wrong = [], []
     for annotation in annotations:
         try:
             things.append(_thing(annotation, mirrors, size))
         except ValueError as error:
-            raise ValueError(f"{path}: the annotation {annotation.get('id')} {error}") from error
-    return Labels(things, size)
+            wrong.append(f"{path}: the annotation {annotation.get('id')} {error}")
+    return Labels(things, size), wrong
+
+
+def _side(given: Any) -> Any:
+    """A side in px, which some tools write as text; what is none stays as it is."""
+    try:
+        return int(given) if float(given) == int(given) else given
+    except (TypeError, ValueError, OverflowError):
+        return given
 
 
 def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
@@ -192,26 +231,46 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
     segments = annotation.get("segmentation") or ()
     polygons, rle, mask = [], None, np.zeros(size, bool)
     if isinstance(segments, Mapping):
-        rle = segments
+        rle = dict(segments)
+        if (sides := list(map(_side, np.ravel(rle.get("size"))))) == list(size):
+            rle["size"] = sides  # which may have been texts
+        elif len(sides) == 2:
+            raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")
         try:
             mask = decode_rle(rle)
         except (TypeError, ValueError) as error:
             raise ValueError(f"has a mask that cannot be read: {error}") from error
-        if mask.shape != size:
-            raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")
+        rle = rle if mask.any() else None
     else:
         parts = segments if isinstance(segments, Sequence) else [segments]
-        polygons = [_numbers("polygon", one, 2) for one in parts]
-    if "bbox" in annotation:
-        x, y, width, height = _numbers("box", annotation["bbox"], 4)[0]
-        box = np.array([x, y, x + width, y + height])
-    elif rle is not None:
-        box = box_of_mask(mask)
-    elif polygons:
-        corners = np.concatenate(polygons)
-        box = np.concatenate((corners.min(0), corners.max(0)))
-    else:
-        raise ValueError("has no bbox")
+        polygons = [_numbers("polygon", one, 2, 0) for one in parts]
+        polygons = [one for one in polygons if area_of(one) > NO_AREA]
+    x, y, width, height = _numbers("box", annotation.get("bbox", [0] * 4), 4)[0]
+    box = np.array([x, y, x + width, y + height])
+    if not (width > 0 and height > 0):  # what is there in its place
+        box = box_of_mask(mask) if rle is not None else box_of(polygons)
+        if np.isnan(box).any():
+            what = (
+                "has no bbox"
+                if "bbox" not in annotation
+                else f"has a bbox of {width:g} × {height:g} px"
+            )
+            raise ValueError(f"{what}, and neither an outline nor a mask with an area")
+    limit = _FAR * max(size)
+    if any((np.abs(corners) > limit).any() for corners in (box, *polygons)):
+        raise ValueError(
+            f"has a box or polygon that reaches farther than {limit} px from its picture of "
+            f"{size[1]} × {size[0]} px"
+        )
+    is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
+    if is_crowd is None:
+        raise ValueError(f"has iscrowd {annotation['iscrowd']!r}, which must be 0 or 1")
+    more = {name: value for name, value in annotation.items() if name not in _OWN}
+    turn = 0.0
+    if rle is None and not polygons and isinstance(attributes := more.get("attributes"), Mapping):
+        turn = _numbers("rotation", attributes.get("rotation") or 0, 1)[0, 0]
+        if turn:  # of CVAT, in degrees
+            more["attributes"] = {k: v for k, v in attributes.items() if k != "rotation"}
     keypoints = annotation.get("keypoints")
     visible = annotation.get("visible", 1.0)
     if not (isinstance(visible, int | float) and 0 <= visible <= 1):
@@ -219,8 +278,7 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
     return Thing(
         annotation["category_id"], box, polygons, rle,
         None if keypoints is None else _numbers("keypoints", keypoints, 3, 0),
-        mirrors[annotation["category_id"]], bool(annotation.get("iscrowd", 0)), visible,
-        {name: value for name, value in annotation.items() if name not in _OWN},
+        mirrors[annotation["category_id"]], is_crowd, visible, math.radians(turn), more,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ def read_woodscape_boxes(root: str | Path) -> LabelledPictures:
 
     Raises:
         FileNotFoundError: pictures, boxes or calibrations are missing.
-        ValueError: a line of another form, or a class with two names.
+        ValueError: a class with two names; from `labels(k)`, a line of another form.
     """
     root = Path(root)
     texts = stems(unnested(root / BOXES), (".txt",))
@@ -49,26 +49,31 @@ def read_woodscape_boxes(root: str | Path) -> LabelledPictures:
     )  # fmt: skip
 
 
-def _rows(file: str, names: dict[int, str]) -> list[list[float]]:
-    rows = []
+def _rows(file: str, names: dict[int, str]) -> tuple[list[list[float]], list[str]]:
+    """The index and the outermost pixels of each thing; and what is wrong with other lines."""
+    rows, wrong = [], []
     for number, line in enumerate(read_text(file).splitlines(), 1):
         if not line.strip():
             continue
         try:
             name, *numbers = line.split(",")
-            index, *box = map(float, numbers)
-            if len(box) != 4 or not np.isfinite(box).all():
+            index, left, top, right, bottom = map(float, numbers)
+            if not (np.isfinite(index) and left <= right < np.inf and top <= bottom < np.inf):
                 raise ValueError
         except ValueError:
-            raise ValueError(
+            wrong.append(
                 f"{file}, line {number}: must be name,index,left,top,right,bottom, got {line!r}"
-            ) from None
+            )
+            continue
         if names.setdefault(int(index), name) != name:
             raise ValueError(f"{file} names the class {int(index)} {name}, not {names[int(index)]}")
-        rows.append([index, *box])
-    return rows
+        rows.append([index, left, top, right, bottom])
+    return rows, wrong
 
 
-def _labels(rows: Sequence[Sequence[float]], size: Size) -> Labels:
+def _labels(
+    raw: tuple[Sequence[Sequence[float]], list[str]], size: Size
+) -> tuple[Labels, list[str]]:
+    rows, wrong = raw
     outermost = np.array([0, 0, 1, 1])
-    return Labels([Thing(int(index), np.add(box, outermost)) for index, *box in rows], size)
+    return Labels([Thing(int(index), np.add(box, outermost)) for index, *box in rows], size), wrong

@@ -3,11 +3,12 @@
 The labels of `…/images/…/NAME.jpg` are in `…/labels/…/NAME.txt`, or else beside the picture; a
 picture without a file has no things. `data.yaml` has the names of the classes, and `kpt_shape` if
 there are keypoints; or `classes.txt` has one name per line. All numbers are shares of the sides of
-the picture.
+the picture. The four corners of an oriented box are an outline, and become one of many corners.
 
 Source: docs.ultralytics.com/datasets.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,25 +21,30 @@ from darswin.data.cameras import Calibrations
 from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing
 from darswin.data.scenes.files import calibration_in, pictures_in
 from darswin.utils.files import replace_file
+from darswin.utils.regions import NO_AREA, area_of, box_of
 from darswin.utils.text import read_text
 
+_SPLITS = ("train", "val", "test")
+_FAR = 100  # a share of a side that no thing reaches
 _NAMES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt")
 
 
-def is_yolo(root: Path) -> bool:
-    """True for a folder that has a file of classes."""
-    return any((root / name).is_file() for name in _NAMES)
+def is_yolo(path: Path) -> bool:
+    """True for a folder that has a file of classes, or for its data.yaml."""
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return path.is_file()
+    return any((path / name).is_file() for name in _NAMES)
 
 
-def read_yolo(root: str | Path) -> LabelledPictures:
+def read_yolo(path: str | Path) -> LabelledPictures:
     """The pictures below a folder, of all splits, and their things.
 
     Raises:
         FileNotFoundError: no classes, no pictures, or no labels.
         ValueError: from `labels(k)`, a line of another form; it names the file.
     """
-    root = Path(root)
-    names, per_keypoint = _classes(root)
+    root, content = _content(Path(path))
+    names, per_keypoint = content["names"], (content.get("kpt_shape") or (0, 0))[1]
     pictures = pictures_in(root)
     texts = [str(_text_of(root, Path(stem))) for stem in pictures]
     if not any(Path(text).is_file() for text in texts):
@@ -56,11 +62,15 @@ def write_yolo(
     root: str | Path,
     pictures: Sequence[tuple[Mapping[str, Any], Labels]],
     categories: Sequence[Mapping[str, Any]],
+    more: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes the text files and `data.yaml` for pictures in `root`; arguments as for `write_coco`.
 
     The classes are the categories in their order. A thing with masks or without an outline is
     written as a box, and parts of an outline are joined. Crowds are left out, as YOLO has none.
+
+    Args:
+        more: other entries of `data.yaml`, such as the splits.
     """
     number = {category["id"]: k for k, category in enumerate(categories)}
     shape = None
@@ -76,8 +86,8 @@ def write_yolo(
                 shape = list(thing.keypoints.shape)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))
         replace_file(text, "".join(f"{line}\n" for line in lines))
-    content: dict[str, Any] = {"path": ".", "train": "images", "val": "images"}
-    content |= {"names": {k: category["name"] for k, category in enumerate(categories)}}
+    names = {k: category["name"] for k, category in enumerate(categories)}
+    content = {"path": ".", **(more or {}), "names": names}
     content |= {} if shape is None else {"kpt_shape": shape}
     replace_file(Path(root) / _NAMES[0], yaml.safe_dump(content, sort_keys=False))
 
@@ -105,52 +115,128 @@ def _text_of(root: Path, stem: Path) -> Path:
     return root.joinpath(*parts[:-1], f"{parts[-1]}.txt")
 
 
-def _classes(root: Path) -> tuple[list[str], int]:
-    """The names, and the numbers of each keypoint: 0 if there are none."""
-    file = next((root / name for name in _NAMES if (root / name).is_file()), None)
-    if file is None:
-        raise FileNotFoundError(f"no data.yaml or classes.txt in {root}")
+def _content(path: Path) -> tuple[Path, dict[str, Any]]:
+    """The folder of the pictures, and what the file of classes says; its names as a list."""
+    file = path
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        found = [path / name for name in _NAMES if (path / name).is_file()]
+        if not found:
+            raise FileNotFoundError(f"no data.yaml or classes.txt in {path}")
+        file = found[0]
     if file.suffix == ".txt":
-        return [line.strip() for line in read_text(file).splitlines() if line.strip()], 0
+        names = [line.strip() for line in read_text(file).splitlines() if line.strip()]
+        return file.parent, {"names": names}
     try:
-        content = yaml.safe_load(read_text(file))
+        content = dict(yaml.safe_load(read_text(file)))
         names, shape = content["names"], content.get("kpt_shape")
         if isinstance(names, Mapping):
             names = [names[k] for k in range(len(names))]
-        return list(map(str, names)), 0 if shape is None else int(shape[1])
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, IndexError) as error:
+        content |= {"names": list(map(str, names))}
+        content |= {} if shape is None else {"kpt_shape": [int(number) for number in shape[:2]]}
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{file} must name the classes 0, 1, … under names: {error}") from error
+    root = file.parent / str(content.get("path") or ".")
+    return (root if root.is_dir() else file.parent), content
 
 
-def _labels(text: str, size: Size, classes: int, per_keypoint: int) -> Labels:
-    sides, things = np.array(size[::-1], float), []
-    lines = read_text(text).splitlines() if Path(text).is_file() else []
-    for line_number, line in enumerate(lines, 1):
-        if not line.strip():
+def moved_splits(
+    source: Path, folder: Path, new_names: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Any], list[str]]:
+    """The entries of `data.yaml` for pictures that have moved to another folder.
+
+    The lists of pictures of the splits are written anew.
+
+    Args:
+        source: the folder or data.yaml that was read. folder: of the new pictures.
+        new_names: the new pictures of each old one, relative to their folders.
+
+    Returns:
+        The entries; and the splits that are left out because their pictures are not there, in
+        words.
+    """
+    root, content = _content(source)
+    missing = []
+    for split in _SPLITS:
+        if not content.get(split):
             continue
-        try:
-            category, *rest = map(float, line.split())
-            numbers = np.array(rest)
-        except ValueError:
-            category, numbers = -1.0, np.zeros(0)
-        keypoints = None
-        if per_keypoint and len(numbers) > 4 and (len(numbers) - 4) % per_keypoint == 0:
-            keypoints = numbers[4:].reshape(-1, per_keypoint)
-            numbers = numbers[:4]
-            seen = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
-            keypoints = np.column_stack((keypoints[:, :2] * sides, seen))
-        is_class = category in range(classes)
-        is_form = len(numbers) == 4 or (len(numbers) >= 6 and len(numbers) % 2 == 0)
-        if not (is_class and is_form and np.isfinite(numbers).all()):
-            raise ValueError(
-                f"{text}, line {line_number}: must be a class below {classes} and 4 numbers of a "
-                f"box, or pairs of an outline, got {line.strip()[:80]!r}"
-            )
-        table = numbers.reshape(-1, 2) * sides
-        if len(table) == 2:
-            box = np.concatenate((table[0] - table[1] / 2, table[0] + table[1] / 2))
-            things.append(Thing(int(category), box, keypoints=keypoints))
-        else:
-            box = np.concatenate((table.min(0), table.max(0)))
-            things.append(Thing(int(category), box, [table]))
-    return Labels(things, size)
+        given = content[split] if isinstance(content[split], list) else [content[split]]
+        found = [_below(root, str(one)) for one in given]
+        if lost := [one for one, there in zip(given, found, strict=True) if there is None]:
+            missing.append(f"{split}: {', '.join(map(str, lost))}")
+        kept = [there for there in found if there is not None]
+        for there in kept:
+            if (root / there).is_file():
+                _write_list(root, there, folder, new_names)
+        content[split] = kept if isinstance(content[split], list) else "".join(kept)
+        if not kept:
+            del content[split]
+    for name in ("path", "names"):
+        content.pop(name, None)
+    return content, missing
+
+
+def _below(root: Path, given: str) -> str | None:
+    """A folder or list of pictures of a split relative to `root`. Roboflow writes "../" before it,
+    though it is beside data.yaml."""
+    plain = given
+    while plain.startswith("../"):
+        plain = plain[3:]
+    for name in dict.fromkeys((given, plain)):
+        place = Path(os.path.relpath(root / name, root))
+        if ".." not in place.parts and (root / place).exists():
+            return place.as_posix()
+    return None
+
+
+def _write_list(
+    root: Path, name: str, folder: Path, new_names: Mapping[str, Sequence[str]]
+) -> None:
+    """The list of pictures of a split, with the new names."""
+    lines = []
+    for line in map(str.strip, read_text(root / name).splitlines()):
+        places = [root / name / ".." / line, root / line]
+        files = [os.path.relpath(place, root) for place in places]
+        lines += next((new_names[file] for file in files if file in new_names), ())
+    replace_file(folder / name, "".join(f"./{line}\n" for line in lines))
+
+
+def _labels(text: str, size: Size, classes: int, per_keypoint: int) -> tuple[Labels, list[str]]:
+    things, wrong = [], []
+    lines = read_text(text).splitlines() if Path(text).is_file() else []
+    for number, line in enumerate(lines, 1):
+        if line.strip():
+            try:
+                things.append(_thing(line, np.array(size[::-1], float), classes, per_keypoint))
+            except ValueError as error:
+                wrong.append(f"{text}, line {number}: {error}, got {line.strip()[:80]!r}")
+    return Labels(things, size), wrong
+
+
+def _thing(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Thing:
+    try:
+        category, *rest = map(float, line.split())
+        numbers = np.array(rest)
+    except ValueError:
+        category, numbers = -1.0, np.zeros(0)
+    keypoints = None
+    if per_keypoint and len(numbers) > 4 and (len(numbers) - 4) % per_keypoint == 0:
+        keypoints = numbers[4:].reshape(-1, per_keypoint)
+        numbers = numbers[:4]
+        seen = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
+        keypoints = np.column_stack((keypoints[:, :2] * sides, seen))
+    is_form = len(numbers) == 4 or (len(numbers) >= 6 and len(numbers) % 2 == 0)
+    if not (category in range(classes) and is_form and np.isfinite(numbers).all()):
+        raise ValueError(
+            f"must be a class below {classes} and 4 numbers of a box, or pairs of an outline"
+        )
+    if np.abs(numbers).max() > _FAR:
+        raise ValueError(f"must be shares of the sides of the picture, none above {_FAR}")
+    table = numbers.reshape(-1, 2) * sides
+    if len(table) == 2:
+        box = np.concatenate((table[0] - table[1] / 2, table[0] + table[1] / 2))
+    else:
+        box = box_of([table])
+    if not (box[:2] < box[2:]).all():
+        raise ValueError("must have an area")
+    has_outline = len(table) > 2 and area_of(table) > NO_AREA
+    return Thing(int(category), box, [table] if has_outline else (), keypoints=keypoints)

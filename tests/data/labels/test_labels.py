@@ -153,7 +153,7 @@ class Shifted:
     size, mirrored = (80, 100), False
 
     def to_new(self, points):
-        return np.stack(((points[..., 0] + 30) % 100, points[..., 1]), -1)
+        return np.stack(((points[..., 0] + 30.5) % 100 - 0.5, points[..., 1]), -1)
 
     def target(self, target):
         return np.roll(target, 30, 1)[: self.size[0]]

@@ -1,0 +1,240 @@
+"""What a map of points shows of regions: the rest is cut off along the rim of what it shows.
+
+A region is given by its outline. Where the outline leaves what is shown, the rim goes on in its
+place, as Weiler and Atherton (1977) cut a polygon with another one. The rim is found by halving,
+along rays from a point that is shown.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+PointMap = Callable[[np.ndarray], np.ndarray]
+
+NO_AREA = 1e-6  # px², of rounding
+_HALVINGS = 30
+_RAYS = 360
+_TURN = np.linspace(-np.pi, np.pi, _RAYS, endpoint=False)
+_GRID = np.stack(np.meshgrid(*[(np.arange(16) + 0.5) / 16] * 2), -1).reshape(-1, 2)
+_SAME = 1e-3  # rad, or px at a border: places that differ by rounding
+# Points of a thing have a seam between them if they are far from each other in the new picture, and
+# nearer than this part of the thing in the old one.
+_NEAR = 1 / 3
+
+
+class Part(NamedTuple):
+    """A part that is shown, by its outline: `old` (P, 2), and `new` (P, D), where the map leads."""
+
+    old: np.ndarray
+    new: np.ndarray
+
+
+def area_of(outline: np.ndarray) -> float:
+    """The area inside an outline (P, 2)."""
+    return abs(_signed_area(outline))
+
+
+def box_of(outlines: Sequence[np.ndarray]) -> np.ndarray:
+    """The box (4,) around outlines (P, 2); NaN without a point."""
+    points = np.concatenate([np.zeros((0, 2)), *outlines])
+    if not len(points):
+        return np.full(4, np.nan)
+    return np.concatenate((points.min(0), points.max(0)))
+
+
+def contains(outline: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point (2,) is inside an outline (P, 2)."""
+    x, y = (outline - point).T
+    ahead_x, ahead_y = np.roll(x, -1), np.roll(y, -1)
+    crosses = (y > 0) != (ahead_y > 0)
+    side = (x * ahead_y - y * ahead_x) * np.where(ahead_y > y, 1, -1)
+    return bool((crosses & (side > 0)).sum() % 2)
+
+
+def shown_parts(
+    outlines: Sequence[np.ndarray], points_map: PointMap, size: tuple[int, int] | None = None
+) -> list[tuple[list[Part], float]]:
+    """What a map shows of regions.
+
+    A region that jumps from one end of a picture all around to the other has one part, the largest:
+    a box has one place.
+
+    Args:
+        outlines: (P, 2), with points that are close to each other.
+        points_map: a function from points (Q, 2) to (Q, D), NaN where nothing is shown.
+        size: (H, W) of the new picture, which covers (0, 0) to (W, H). Things end at its borders.
+
+    Returns:
+        For each region, the parts that are shown; and their share of its area, 0 to 1.
+    """
+
+    def carry(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        new = points_map(points)
+        shown = np.isfinite(new).all(-1)
+        if size is not None:
+            shown &= ((new >= 0) & (new <= size[::-1])).all(-1)
+        return new, shown
+
+    if not len(outlines):
+        return []
+    lines = [line if _signed_area(line) >= 0 else line[::-1] for line in outlines]
+    ends = np.cumsum([len(line) for line in lines])[:-1]
+    new, shown = carry(np.concatenate(lines))
+    parts: list[list[Part]] = [[] for _ in lines]
+    cut: list[_Cut] = []
+    for k, (line, there, seen) in enumerate(
+        zip(lines, np.split(new, ends), np.split(shown, ends), strict=True)
+    ):
+        if len(line) and seen.all():
+            parts[k] = [Part(line, there)]
+        elif len(line) and np.isfinite(line).all():
+            cut.append(_Cut(k, line, there, seen))
+    for one, found in zip(cut, _cut_parts(cut, carry), strict=True):
+        parts[one.number] = found
+    answers = []
+    for line, found, seen in zip(lines, parts, np.split(shown, ends), strict=True):
+        if size is not None:
+            found = _in_one_place([_with_corners(part, size) for part in found], size[1])
+        whole = area_of(line)
+        if whole > NO_AREA:
+            share = min(sum(area_of(part.old) for part in found) / whole, 1.0)
+        else:
+            share = float(seen.mean()) if len(found) else 0.0
+        answers.append((found, share))
+    return answers
+
+
+class _Cut(NamedTuple):
+    """A region of which a part is not shown."""
+
+    number: int
+    line: np.ndarray
+    new: np.ndarray
+    seen: np.ndarray
+
+
+def _cut_parts(
+    cut: Sequence[_Cut], carry: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> list[list[Part]]:
+    """The parts of regions inside the rim. All rims are searched at once."""
+    if not cut:
+        return []
+    low = np.array([one.line.min(0) for one in cut])
+    sides = np.array([one.line.max(0) for one in cut]) - low
+    grids = low[:, None] + _GRID * sides[:, None]
+    on_grid = carry(grids.reshape(-1, 2))[1].reshape(len(cut), -1)
+    rays = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
+    middles, inner, outer = [], [], []
+    for one, grid, seen, side in zip(cut, grids, on_grid, sides, strict=True):
+        candidates = np.concatenate((grid[seen], one.line[one.seen]))
+        if not len(candidates):
+            middles.append(None)
+            continue
+        gaps = candidates - (grid[seen] if seen.any() else candidates).mean(0)
+        middle = candidates[np.argmin((gaps**2).sum(1))]
+        middles.append(middle)
+        ahead = np.roll(one.line, -1, 0)
+        crosses = one.seen != np.roll(one.seen, -1)
+        starts = one.seen[crosses, None]
+        inner += [np.where(starts, one.line[crosses], ahead[crosses]), np.tile(middle, (_RAYS, 1))]
+        outer += [np.where(starts, ahead[crosses], one.line[crosses]),
+                  middle + 1.01 * np.hypot(*side) * rays]  # fmt: skip
+    if not inner:
+        return [[] for _ in cut]
+    lengths = np.cumsum([len(points) for points in inner])[:-1]
+    found = _last_shown(np.concatenate(inner), np.concatenate(outer), carry)
+    pieces = iter(zip(*(np.split(points, lengths) for points in found), strict=True))
+    return [
+        [] if middle is None else _walk(one, middle, Part(*next(pieces)), Part(*next(pieces)))
+        for one, middle in zip(cut, middles, strict=True)
+    ]
+
+
+def _last_shown(
+    inner: np.ndarray,
+    outer: np.ndarray,
+    carry: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """The last points that are shown on the ways from points that are to points that are not, and
+    where the map leads."""
+    (new, _), (ends, is_shown) = carry(inner), carry(outer)
+    inner, new = (np.where(is_shown[:, None], a, b) for a, b in ((outer, inner), (ends, new)))
+    for _ in range(_HALVINGS):
+        middle = (inner + outer) / 2
+        there, shown = carry(middle)
+        inner = np.where(shown[:, None], middle, inner)
+        new = np.where(shown[:, None], there, new)
+        outer = np.where(shown[:, None], outer, middle)
+    return inner, new
+
+
+def _walk(one: _Cut, middle: np.ndarray, crossings: Part, rim: Part) -> list[Part]:
+    """The parts of a region, along its outline and along the rim, both with increasing azimuth."""
+    places = np.flatnonzero(one.seen != np.roll(one.seen, -1))
+    if not len(places):
+        return [rim] if contains(one.line, middle) else []
+    order = np.arange(len(places))
+    if one.seen[places[0]]:  # begins where the outline comes in
+        order = np.roll(order, -1)
+    entries, exits = order[::2], order[1::2]
+    azimuth = np.arctan2(*(crossings.old - middle).T[::-1])
+    rings, todo = [], set(range(len(entries)))
+    while todo:
+        k, pieces = min(todo), []
+        while k in todo:
+            todo.remove(k)
+            first, last = places[entries[k]] + 1, places[exits[k]] + 1
+            if last <= first:
+                last += len(one.line)
+            within = np.arange(first, last) % len(one.line)
+            ahead = (azimuth[entries] - azimuth[exits[k]] + _SAME) % (2 * np.pi) - _SAME
+            after = int(np.argmin(ahead))
+            on_rim = (_TURN - azimuth[exits[k]]) % (2 * np.pi)
+            chosen = np.flatnonzero(on_rim < ahead[after])
+            chosen = chosen[np.argsort(on_rim[chosen])]
+            pieces += [
+                Part(*(of[entries[k : k + 1]] for of in crossings)),
+                Part(one.line[within], one.new[within]),
+                Part(*(of[exits[k : k + 1]] for of in crossings)),
+                Part(*(of[chosen] for of in rim)),
+            ]
+            k = after
+        rings.append(Part(*(np.concatenate(of) for of in zip(*pieces, strict=True))))
+    return rings
+
+
+def _with_corners(part: Part, size: tuple[int, int]) -> Part:
+    """A part with the corners of the picture that lie between neighbours on two borders."""
+    sides = np.array(size[::-1])
+    on = (np.abs(part.new) < _SAME) | (np.abs(part.new - sides) < _SAME)
+    ahead, new = np.roll(on, -1, 0), np.roll(part.new, -1, 0)
+    turns = (on[:, 0] != on[:, 1]) & (on == ahead[:, ::-1]).all(1)
+    corners = np.where(on, part.new, new)[turns]
+    between = ((part.old + np.roll(part.old, -1, 0)) / 2)[turns]
+    places = np.flatnonzero(turns) + 1
+    return Part(np.insert(part.old, places, between, 0), np.insert(part.new, places, corners, 0))
+
+
+def _in_one_place(parts: list[Part], width: int) -> list[Part]:
+    """The parts; or if one jumps from one end of a picture to the other, only the largest."""
+    pieces, jumped = [], False
+    for old, new in parts:
+        leaps = np.abs(np.roll(new[:, 0], -1) - new[:, 0]) > width / 2
+        near = np.abs(np.roll(old, -1, 0) - old).max(1) < _NEAR * np.ptp(old, axis=0).max()
+        places = np.flatnonzero(leaps & near)
+        if not len(places):
+            pieces.append(Part(old, new))
+            continue
+        jumped = True
+        turned = [np.roll(of, -places[0] - 1, 0) for of in (old, new)]
+        split = (np.split(of, places[1:] - places[0]) for of in turned)
+        pieces += [Part(*both) for both in zip(*split, strict=True)]
+    return [max(pieces, key=lambda part: area_of(part.new))] if jumped else pieces
+
+
+def _signed_area(outline: np.ndarray) -> float:
+    if not len(outline):
+        return 0.0
+    x, y = (outline - outline[0]).T
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
