@@ -245,14 +245,11 @@ def test_a_stretched_board_is_doubted():
         assert not doubts or words[4:] in doubts[0]
 
 
-def test_pixels_and_boards_that_never_turn_cannot_be_told_apart():
+def test_words_for_pixels_and_boards_that_are_stretched():
     said = ["of the pixels or of the board: measure"], ["the board seems"], ["seem 1 % longer"], []
     for stretch, words in zip(((0.01, 0.01), (0, 0.01), (0.01, 0), (0, 0)), said, strict=True):
         found = _stretched(*stretch)
         assert len(found) == len(words) and all(map(str.__contains__, found, words))
-    still = rig(true_lens("KannalaBrandt", 120, seed=1), 12, noise=0.05, spin=0.0)
-    (doubt,) = (text for text in of(stretched(still, 1.01)).doubts if "along" in text)
-    assert "of the pixels or of the board" in doubt
 
 
 def test_left_out_is_the_error_of_pictures_that_were_left_out():
