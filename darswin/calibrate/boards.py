@@ -120,7 +120,8 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         return "" if known else f"{columns}x{rows} inner corners"
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
-    parameters, found = cv2.aruco.DetectorParameters(), {}
+    parameters = cv2.aruco.DetectorParameters()
+    found: dict[str, list[int]] = {}
     for name in (name for name in _names() if "H" not in name):  # 36H11 is another name of 36h11
         # Kalibr draws the tags of its only set with a border of two bits.
         for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
