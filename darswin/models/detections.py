@@ -94,8 +94,10 @@ def _masks_in_image(masks: Tensor, view: View, prepared: Prepared, image: int) -
     if view.count > 1:
         raise ValueError("masks of tiles cannot come back: choose a view of one picture")
     if isinstance(prepared.back, Tensor):
-        number = min(image, len(prepared.back) - 1)
-        prepared = prepared._replace(back=prepared.back[number : number + 1])
+        number, around = min(image, len(prepared.back) - 1), prepared.around
+        if around is not None and len(around) > 1:
+            around = around[number : number + 1]
+        prepared = prepared._replace(back=prepared.back[number : number + 1], around=around)
     height, width = prepared.size
     in_image = view.back(masks.reshape(1, -1, *masks.shape[-2:]), prepared)
     return in_image.view(*masks.shape[:-2], height, width)
