@@ -131,7 +131,7 @@ class _Left(NamedTuple):
     @property
     def fits_no_tile(self) -> bool:
         """Whether the tiles show enough of it only together."""
-        return sum(self.shares) >= LEAST_VISIBLE
+        return bool(sum(self.shares) >= LEAST_VISIBLE)
 
 
 class _Warped(NamedTuple):
@@ -364,7 +364,7 @@ def _write(
     left = [
         {
             "file": name, "id": lost.thing.more.get("id"), "category": names[lost.thing.category],
-            "visible": round(max(lost.shares), 3), "fits_no_tile": lost.fits_no_tile,
+            "visible": round(float(max(lost.shares)), 3), "fits_no_tile": lost.fits_no_tile,
         }
         for name, one in zip(data.files, found, strict=True)
         for lost in one.left

@@ -210,7 +210,7 @@ def _labels(
 def _side(given: Any) -> Any:
     """A side in px, which some tools write as text; what is none stays as it is."""
     try:
-        return int(given) if float(given) == int(given) else given
+        return int(number) if (number := float(given)).is_integer() else given
     except (TypeError, ValueError, OverflowError):
         return given
 
