@@ -122,9 +122,9 @@ def _tables(values: Tensor | None, count: int) -> Any:
 
 def _carried(
     found: Mapping[str, Tensor],
+    size: tuple[int, int],
     points: np.ndarray | None,
     rays: np.ndarray | None,
-    size: tuple[int, int],
 ) -> dict[str, Tensor]:
     """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image (H, W)
     along rays (H', W', 3)."""

@@ -125,7 +125,9 @@ def _cut_parts(
     grids = low[:, None] + _GRID * sides[:, None]
     on_grid = carry(grids.reshape(-1, 2))[1].reshape(len(cut), -1)
     rays = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
-    middles, inner, outer = [], [], []
+    middles: list[np.ndarray | None] = []
+    inner: list[np.ndarray] = []
+    outer: list[np.ndarray] = []
     for one, grid, seen, side in zip(cut, grids, on_grid, sides, strict=True):
         candidates = np.concatenate((grid[seen], one.line[one.seen]))
         if not len(candidates):

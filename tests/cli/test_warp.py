@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -440,26 +441,19 @@ def test_what_cannot_be_read_is_named_at_the_end(flat, tmp_path, capsys):
     assert [thing.more["id"] for thing in data.labels(0).things] == [3] and len(data) == 1
 
 
-@pytest.mark.parametrize(
-    ("box", "kept"), [([5, 5, 390, 290], True), ([-1e3, -1e3, 3e3, 3e3], False)]
-)
-def test_a_thing_that_is_larger_than_the_tiles(flat, tmp_path, capsys, box, kept):
-    """It is labelled where a tile shows a fifth of it, and else named as what it is."""
+@pytest.mark.parametrize(("shares", "said"), [((0.1, 0.15), "too large for"), ((0.1, 0), "left")])
+def test_what_no_tile_shows_is_named_as_what_it_is(
+    flat, tmp_path, capsys, monkeypatch, shares, said
+):
+    def lost(things, move):
+        given = (*shares, 0.0, 0.0)[len(calls) % 4]
+        calls.append(move)
+        return [replace(thing, visible=given) for thing in things]
 
-    def edit(content):
-        content["annotations"] = [content["annotations"][0] | {"bbox": box, "segmentation": []}]
-        del content["images"][1:]
-
-    lens = json.dumps({"model": "Equidistant", "focal": 110.0, "theta_max": 2.0})
-    if not kept:
-        lens = lens.replace("110", "1100")
-    out = tmp_path / "out"
-    file = warp(edited(flat, tmp_path, edit), out, "tiles:4", "--size", "96,96", "--lens", lens)
-    things = json.loads(file.read_text())["annotations"]
-    assert bool(things) == kept
-    if not kept:
-        (left,) = json.loads((out / "left.json").read_text())
-        assert ("too large for the tiles" in capsys.readouterr().out) == left["fits_no_tile"]
+    calls = []
+    monkeypatch.setattr(module, "move_things", lost)
+    warp(flat, tmp_path / "out", "tiles:4", "--size", "32,32", "--lens", FLAT)
+    assert f"9 things {'are' if 'large' in said else 'have'} {said}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("layout", ["images/train", "train/images", "lists", "only names"])
