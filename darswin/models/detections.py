@@ -74,8 +74,9 @@ def detections_to_images(
     rays = _tables(None if prepared.rays is None else prepared.rays.movedim(1, -1), view.count)
     results = []
     for k, tiles in enumerate(images):
+        own_points, own_rays = (of[min(k, len(of) - 1)] for of in (points, rays))
         carried = [
-            _carried(part, *(of[min(k, len(of) - 1)][tile] for of in (points, rays)), prepared.size)
+            _carried(part, prepared.size, own_points[tile], own_rays[tile])
             for tile, part in enumerate(tiles)
         ]
         joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}

@@ -453,7 +453,7 @@ def test_what_no_tile_shows_is_named_as_what_it_is(
     calls = []
     monkeypatch.setattr(module, "move_things", lost)
     warp(flat, tmp_path / "out", "tiles:4", "--size", "32,32", "--lens", FLAT)
-    assert f"9 things {'are' if 'large' in said else 'have'} {said}" in capsys.readouterr().out
+    assert f"9 things {'are' if 'large' in said else 'have'} {said} the" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("layout", ["images/train", "train/images", "lists", "only names"])
