@@ -71,9 +71,9 @@ def shown_parts(
 
     def carry(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         new = points_map(points)
-        shown: np.ndarray = np.isfinite(new).all(axis=-1)
+        shown = np.asarray(np.isfinite(new).all(axis=-1))
         if size is not None:
-            shown = shown & ((new >= 0) & (new <= size[::-1])).all(axis=-1)
+            shown &= ((new >= 0) & (new <= size[::-1])).all(axis=-1)
         return new, shown
 
     if not len(outlines):
