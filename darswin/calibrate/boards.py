@@ -126,7 +126,8 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         # Kalibr draws the tags of its only set with a border of two bits.
         for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
             detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
-            seen = [] if (numbers := detect(grey)[1]) is None else numbers.ravel().tolist()
+            numbers = detect(grey)[1]
+            seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
             found[name] = max(found.get(name, []), seen, key=len)
     most = max(map(len, found.values()))
     if most < 4:
