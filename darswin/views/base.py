@@ -1,13 +1,15 @@
 """The seam between lenses and networks: what a view is."""
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeVar
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from darswin.lens import Lens
+from darswin.ops._library import autocast_dtype
 from darswin.ops.checks import (
     FRAME_CHANNELS,
     channels_first,
@@ -53,6 +55,20 @@ class PixelGrid(NamedTuple):
     affine: Tensor | None = None
     points: Tensor | None = None
     plan: Tensor | None = None
+
+
+def in_full_precision(prepare: Callable[..., "Prepared"]) -> Callable[..., "Prepared"]:
+    """`prepare` of a view without autocast, whose matrix products would move points by pixels."""
+
+    @functools.wraps(prepare)
+    def run(self: Any, lens: Lens | None, size: Pair, **options: Any) -> Prepared:
+        # Where autocast is off, there is no context: a graph would get one of its own.
+        if not isinstance(lens, Lens) or autocast_dtype(lens.theta_max) is None:
+            return prepare(self, lens, size, **options)
+        with torch.autocast(lens.theta_max.device.type, enabled=False):
+            return prepare(self, lens, size, **options)
+
+    return run
 
 
 class Prepared(NamedTuple):

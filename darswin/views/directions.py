@@ -362,9 +362,8 @@ def up_of(
     check_turn("pitch", pitch)
     if extrinsics is None:
         level = math.cos(pitch)
-        return unit_vector(
-            "up", (-level * math.sin(roll), -level * math.cos(roll), math.sin(pitch))
-        )
+        up = (-level * math.sin(roll), -level * math.cos(roll), math.sin(pitch))
+        return unit_vector("up", up)
     if roll or pitch:
         raise ValueError("give either extrinsics, or roll and pitch")
     pose = as_tensor(extrinsics, torch.float64)
@@ -373,8 +372,8 @@ def up_of(
     turns = torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4)
     if not (turns and torch.linalg.det(rotation) > 0):
         raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
-    up = rotation.T @ torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
-    return unit_vector("up", up)
+    above = torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
+    return unit_vector("up", rotation.T @ above)
 
 
 def turned(yaw: float = 0.0, pitch: float = 0.0) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from darswin.views.base import (
     check_count,
     check_lens,
     check_seen_images,
+    in_full_precision,
 )
 
 Points = TypeVar("Points", np.ndarray, Tensor)
@@ -93,6 +94,7 @@ class PixelView(View):
         return _exactly(points, lens, size, lambda pixels, exact: self.to_points(
             exact.unproject_points(pixels, size), exact, size, **of_tile))  # fmt: skip
 
+    @in_full_precision
     def prepare(
         self,
         lens: Lens | None,

@@ -35,6 +35,7 @@ from darswin.views.base import (
     check_count,
     check_lens,
     check_seen_images,
+    in_full_precision,
 )
 from darswin.views.polar_back import nearest, places_of, resized_around, shown_by
 from darswin.views.registry import register_view
@@ -119,6 +120,7 @@ class PolarView(View):
         self.jitter = check_jitter(jitter)
         self.in_pixels = layout == "image"
 
+    @in_full_precision
     def prepare(
         self,
         lens: Lens | None,

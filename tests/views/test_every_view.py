@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from helpers import product
 from torch import nn
+from torch.utils._pytree import tree_leaves
 
 from darswin import create_model
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical, pixels
@@ -98,6 +99,20 @@ def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, kind):
     radial = lens.is_radial and lens.affine is None
     if radial or not isinstance(view, PolarView):
         torch.testing.assert_close(seen[inside], points[inside], rtol=0, atol=2e-3)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("name", "kind"), product(list_views(), LENSES))
+def test_autocast_moves_no_point(name, kind):
+    view = make_view(name, (32, 40) if name not in ("none", "square") else (48, 48))
+    size = (48, 48) if name == "none" else SIZE
+    want = view.prepare(LENSES[kind], size, maps=[(4, 8)])
+    with torch.autocast("cpu", torch.bfloat16):
+        found = view.prepare(LENSES[kind], size, maps=[(4, 8)])
+    for one, other in zip(tree_leaves(found), tree_leaves(want), strict=True):
+        assert not isinstance(one, torch.Tensor) or (
+            torch.equal(one, other) and one.dtype == other.dtype
+        )
 
 
 @every_view
