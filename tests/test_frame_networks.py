@@ -5,14 +5,13 @@ import os
 import subprocess
 import sys
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
+from frame_samples import MEAN, ROUND, STD, in_layout, random_frame
 from helpers import product
 from torch import nn
 
@@ -22,6 +21,7 @@ from darswin.deploy import packed
 from darswin.deploy.quantize import quantize_model
 from darswin.lens import Equidistant, Mei, Polynomial
 from darswin.models import Encoder, FeatureMaps, LensAdapter
+from darswin.views import PolarView
 
 LENSES = {
     "round": Equidistant.from_fov(2.8, 30.0),
@@ -38,7 +38,8 @@ CASES = [
     ("darswin_a", dict(features_only=True, out_indices=(0, 2), output_fmt="NCHW")),
     ("swin", dict(features_only=True, out_indices=1)),
     *((name, dict(task="distance")) for name in FAMILIES if "unet" in name),
-    *((name, dict(skip_width=0, places=False)) for name in FAMILIES if "unet" in name),
+    *((name, dict(skip_width=0, places=False, rays=False)) for name in FAMILIES if "unet" in name),
+    ("swin_unet_undis", dict(places=False)),
     ("darswin_unet_ra", dict(rays=True, num_classes=3)),
     ("swin_unet", dict(view="mercator", size=(64, 128))),
     ("swin", dict(image_size=(24, 48), patch_size=3)),
@@ -135,50 +136,6 @@ def test_quantized_networks_compute_with_8_bits(family, own, tmp_path, monkeypat
         assert 1e-5 < np.abs(one - whole).max() / np.abs(whole).max() < 0.5
 
 
-@pytest.mark.parametrize("family", ["darswin_a", "swin", "darswin_unet_a", "swin_unet_adapted"])
-def test_every_layout_and_number_of_threads_gives_the_same_bits(family, tmp_path):
-    network = network_of(model_of(family), tmp_path)
-    frame = random_frame(*network.size, 3)
-    expected = network(frame)
-    for layout in LAYOUTS:
-        for threads in (1, 2, 5):
-            found = network(in_layout(frame, layout), threads=threads)
-            np.testing.assert_array_equal(found, expected)
-    bgr = np.ascontiguousarray(frame[..., ::-1])
-    np.testing.assert_array_equal(network(bgr[..., ::-1]), expected)
-    assert not np.array_equal(network(bgr), expected)
-
-
-def test_threads_of_python_may_share_a_network(tmp_path):
-    network = network_of(model_of("darswin_unet_a"), tmp_path)
-    pictures = [random_frame(*network.size, 3, seed=seed) for seed in range(6)]
-    expected = [network(picture) for picture in pictures]
-    with ThreadPoolExecutor(4) as pool:
-        for _ in range(5):
-            results = pool.map(lambda p: network(p, threads=2), pictures)
-            for found, right in zip(results, expected, strict=True):
-                np.testing.assert_array_equal(found, right)
-
-
-def test_out_takes_the_result(tmp_path):
-    network = network_of(model_of(), tmp_path)
-    frame = random_frame(*network.size, 3)
-    expected = network(frame)
-    out = np.full_like(expected, np.nan)
-    assert network(frame, out) is out and network(frame, out=out, threads=2) is out
-    np.testing.assert_array_equal(out, expected)
-    read_only = expected.copy()
-    read_only.flags.writeable = False
-    for wrong in (expected.astype(np.float64), expected[:-1], read_only, np.repeat(out, 2)[::2]):
-        with pytest.raises(ValueError, match=r"out must be .* of float32 with shape \(10\)"):
-            network(frame, wrong)
-    with pytest.raises(TypeError, match=r"out must be a NumPy array, got .*list"):
-        network(frame, [out])
-    inside = frame.reshape(-1)[: out.nbytes].view(np.float32)
-    with pytest.raises(ValueError, match="out must not share memory with the frame"):
-        network(frame, inside)
-
-
 def test_a_list_of_outs_takes_the_maps(tmp_path):
     network = network_of(model_of(features_only=True), tmp_path)
     frame = random_frame(*network.size, 3)
@@ -196,24 +153,6 @@ def test_a_list_of_outs_takes_the_maps(tmp_path):
     shared = [memory[: one.size].reshape(one.shape) for one in out]
     with pytest.raises(ValueError, match="the arrays of out must not share memory"):
         network(frame, shared)
-
-
-@pytest.mark.parametrize(
-    ("frame", "error", "words"),
-    [
-        (random_frame(80, 70, 3), ValueError, r"\(H, W\) = \(70, 80\), got \(80, 70\)"),
-        (random_frame(70, 80, 4), ValueError, r"shape \(H, W\).*got \(70, 80, 4\)"),
-        (random_frame(70, 80), ValueError, "the network's 3 channels, got 1"),
-        (random_frame(70, 80, 3).astype(np.float32), TypeError, "array of uint8, got float32"),
-        (torch.zeros(70, 80, 3, dtype=torch.uint8), TypeError, "array of uint8, got .*Tensor"),
-    ],
-)
-def test_wrong_frames_are_explained(frame, error, words, tmp_path):
-    network = network_of(model_of(), tmp_path)
-    with pytest.raises(error, match=words):
-        network(frame)
-    with pytest.raises(ValueError, match="threads must be at least 1"):
-        network(random_frame(70, 80, 3), threads=0)
 
 
 def test_labels_and_normalization(tmp_path):
@@ -529,12 +468,14 @@ def test_the_c_interface(tmp_path):
 @pytest.mark.slow
 @pytest.mark.unsanitized
 @pytest.mark.parametrize("tier", ["default", "avx2", "avx512"])
-def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_path):
+def test_frames_are_read_without_torch_in_little_memory_on_every_tier(tier, tmp_path):
     model = create_model("darswin_a_micro", num_classes=10, mean=MEAN, std=STD).eval()
     frame = random_frame(966, 1280, 3)
     frames.export(model, ROUND, frame.shape[:2], tmp_path / "camera.npz")
     small = quantized_of(model_of())
     frames.export(small, ROUND, (70, 80), tmp_path / "quantized.npz")
+    sampling = PolarView(4, 8, (2, 3), mean=MEAN, std=STD).eval()
+    frames.plan(sampling, ROUND, (70, 80)).save(tmp_path / "plan.npz")
     np.save(tmp_path / "frame.npy", frame)
     code = """if True:
         import re, sys
@@ -544,6 +485,7 @@ def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_pat
         frame = np.load("frame.npy")
         np.save("found.npy", network(frame))
         np.save("quantized.npy", darswin.frames.Network("quantized.npz")(frame[:70, :80]))
+        np.save("tokens.npy", darswin.frames.Sampler("plan.npz")(frame[:70, :80]))
         assert not {"torch", "cv2"} & set(sys.modules)
         peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1])
         assert peak < 60_000, peak
@@ -554,3 +496,5 @@ def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_pat
     with packed.own_alone():
         expected = by_model(optimize(small, torch.int8), frame[:70, :80])
     assert_close([np.load(tmp_path / "quantized.npy")], expected, 0.05)
+    sampled = sampling(torch.from_numpy(frame[:70, :80])[None], ROUND)
+    np.testing.assert_allclose(np.load(tmp_path / "tokens.npy"), sampled[0], atol=1e-5)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from frame_samples import random_frame
+from frame_samples import MEAN, STD, bilinear, random_frame
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +15,6 @@ from darswin.views import make_view
 
 SIZE = (120, 160)
 LENS = KannalaBrandt(40.0, [0.01], math.radians(95), center=[81.0, 58.0])
-MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
 
 
 def by_numpy(plan, frame):
@@ -23,12 +22,8 @@ def by_numpy(plan, frame):
     pixels = frame.reshape(*frame.shape[:2], -1).astype(np.float64)
     if plan.output == "image":
         pixels = (pixels / 255 - np.array(plan.mean)) / np.array(plan.std)
-    padded = np.pad(pixels, ((4, 4), (4, 4), (0, 0)))
-    x, y = plan.columns + 4, plan.rows + 4
-    right, lower = plan.right[..., None].astype(float), plan.lower[..., None].astype(float)
-    upper = padded[y, x] * (1 - right) + padded[y, x + 1] * right
-    under = padded[y + 1, x] * (1 - right) + padded[y + 1, x + 1] * right
-    found = upper * (1 - lower) + under * lower
+    right, lower = plan.right.astype(float), plan.lower.astype(float)
+    found = bilinear(pixels, plan.columns + right, plan.rows + lower)
     if plan.reads > 1:
         found = found.mean(-2)
     if plan.output == "image":

@@ -14,6 +14,7 @@ import quantized
 import study
 import tables
 from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, augmented, headline
+from helpers import in_this_process
 
 from darswin import create_model
 
@@ -92,7 +93,7 @@ def here(monkeypatch, threads):
     """Jobs run one after the other in this process, as `make study` runs them in others."""
     threads(1)
     for program in (study, quantized):
-        monkeypatch.setattr(program, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
+        monkeypatch.setattr(program, "run_all", in_this_process)
 
 
 @pytest.mark.slow

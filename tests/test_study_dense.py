@@ -13,6 +13,7 @@ import torch
 from dense_bounds import BOUNDS, bounds
 from dense_cells import MODELS, STUDIED_MODELS, all_cells
 from dense_trivial import trivial
+from helpers import in_this_process
 from worlds import wad
 from worlds.lenses import draw_lens
 
@@ -82,7 +83,7 @@ def here(monkeypatch, threads):
     """Jobs run one after the other in this process, as `make study-dense` runs them in others."""
     threads(1)
     for program in (dense, dense_data):
-        monkeypatch.setattr(program, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
+        monkeypatch.setattr(program, "run_all", in_this_process)
 
 
 def test_cells_are_trained_and_tested_once(quick, here, capsys):

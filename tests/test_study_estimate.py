@@ -9,6 +9,7 @@ import estimate as study
 import estimate_tables
 import numpy as np
 import pytest
+from helpers import in_this_process
 from worlds.render import rays_of
 
 from darswin.calibrate import lines
@@ -74,7 +75,7 @@ def test_a_search_runs_once_for_some_curves_and_is_forgotten(monkeypatch):
 @pytest.mark.slow
 def test_a_study_of_one_lens(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "pictures_of", draw_rooms)
-    monkeypatch.setattr(study, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
+    monkeypatch.setattr(study, "run_all", in_this_process)
     study.main(["--lens", ROOMS, "--pictures", "2", "--results", str(tmp_path)])
     record = json.loads((tmp_path / "estimate.json").read_text())
     (of,) = record["lenses"]

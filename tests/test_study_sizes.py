@@ -8,6 +8,7 @@ import pytest
 import sizes
 import sizes_tables
 import torch
+from helpers import in_this_process
 from sizes_methods import METHODS, Measurer
 from sizes_scene import (
     BALL,
@@ -79,7 +80,7 @@ def test_every_method_measures_through_every_lens():
 
 @pytest.mark.slow
 def test_cells_are_run_once_and_collected(tmp_path, monkeypatch):
-    monkeypatch.setattr(sizes, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
+    monkeypatch.setattr(sizes, "run_all", in_this_process)
     where = ["--out", str(tmp_path / "out"), "--results", str(tmp_path)]
     sizes.main([*where, *QUICK, "--cell", "raw-0"])
     (file,) = (tmp_path / "out" / "cells").iterdir()

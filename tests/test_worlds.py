@@ -96,7 +96,6 @@ def test_a_box_has_exact_labels_and_distances(box):
 
 @pytest.mark.slow
 def test_a_wall_shows_its_texture_upright_and_not_mirrored(box):
-    """Seen from inside: texel (0, 0) is at the upper left, at each wall's start."""
     at = eye(128, 64, 64)
     targets = eye(0, 32, 100), eye(0, 96, 100), eye(0, 32, 30), eye(0, 96, 30)
     ways = np.array(targets) - at
@@ -115,33 +114,25 @@ def test_a_wall_shows_its_texture_upright_and_not_mirrored(box):
         Perspective(40.0, image_size=(48, 64), theta_max=1.0),
     ],
 )
-def test_distance_is_that_of_planes(box, lens):
-    """Of every pixel, from ray–plane intersections written down here."""
+def test_a_pixel_shows_what_its_ray_meets(box, lens):
     pose = poses.Pose(eye(300, 100, 60), poses.look(0.7, 0.2, -0.1))
     view = render.render(box, pose, render.rays_of(lens))
     height, width = (int(side) for side in lens.image_size[0])
     y, x = np.mgrid[:height, :width]
-    theta, azimuth = lens.unproject_pixels(
-        lens.theta_max.new_tensor(np.stack((x, y), -1).tolist())[None]
-    )
-    theta, azimuth = theta[0].numpy().astype(float), azimuth[0].numpy().astype(float)
+    pixels = lens.theta_max.new_tensor(np.stack((x, y), -1).tolist())[None]
+    theta, azimuth = (angle[0].numpy().astype(float) for angle in lens.unproject_pixels(pixels))
     seen = ~np.isnan(theta)
     assert ((view.labels == scene.NOTHING) == ~seen).all() and (view.distance[~seen] == 0).all()
-    ray = np.stack(
-        (np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)), -1
+    across = np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth)
+    ways = np.stack((*across, np.cos(theta)), -1)[seen] @ pose.rotation.T
+    hits = box.cast(pose.position, ways)
+    known = np.isfinite(hits.distance)
+    same = view.labels[seen] == hits.label
+    assert same.mean() > 0.99  # but for rays on an edge
+    np.testing.assert_allclose(
+        view.distance[seen][known & same], hits.distance[known & same], rtol=2e-4
     )
-    way = ray @ pose.rotation.T
-    for name, axis, level in (("liquid", 2, 16), ("ceiling", 2, 128), ("floor", 2, 0)):
-        of_class = view.labels == LABEL[name]
-        expected = (level / wad.METRE - pose.position[axis]) / way[of_class, axis]
-        np.testing.assert_allclose(view.distance[of_class], expected, rtol=2e-4)
-    walls = view.labels == LABEL["wall"]
-    planes = [(0, 0), (0, 512), (1, 0), (1, 256)]
-    with np.errstate(divide="ignore"):
-        met = [(at / wad.METRE - pose.position[axis]) / way[walls, axis] for axis, at in planes]
-    first = np.where(np.array(met) > 0, met, np.inf).min(0)
-    np.testing.assert_allclose(view.distance[walls], first, rtol=2e-4)
-    assert {"liquid", "wall"} <= {geometry.CLASSES[k] for k in np.unique(view.labels[seen])}
+    assert {"liquid", "wall"} <= {geometry.CLASSES[k] for k in hits.label}
     assert (view.distance[view.labels == LABEL["sky"]] == 0).all()
 
 

@@ -58,24 +58,6 @@ def test_a_wrong_gradient_is_a_disagreement():
         peers.compare(case("forward+backward"), runs, INPUTS, 1e-4)
 
 
-def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(peers, "THREADS", [1, 2])
-    before = torch.get_num_threads()
-    runs = {OURS: double, "peer": double}
-    targets = dict(peer=1e6)
-
-    def job():
-        return peers.compare(case(), runs, INPUTS, 1e-4, targets=targets)
-
-    found = peers.run_suite("suite", [job, job], 1.0, tmp_path)
-    assert [t.threads for t in found if t.name == "peer"] == [1, 2] * 2
-    assert torch.get_num_threads() == before
-    (path,) = tmp_path.glob("suite--*.json")
-    assert Record.load(path).timings == found
-    printed = capsys.readouterr().out
-    assert "| `double` | ours (ms) | peer |" in printed and printed.count("MISSED") >= 4
-
-
 def test_a_candidate_gets_its_threads_before_the_first_frame():
     seen, before = [], torch.get_num_threads()
     on = peers.on_torch_threads(lambda: seen.append(torch.get_num_threads()))
@@ -87,20 +69,27 @@ def test_a_candidate_gets_its_threads_before_the_first_frame():
     assert seen == [2, 1, 2, max(peers.THREADS)]
 
 
-def test_a_suite_has_frames_at_a_cameras_pace_too(tmp_path, capsys, camera, monkeypatch):
+def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, camera, monkeypatch):
     monkeypatch.setattr(peers, "THREADS", [1, 2])
-    starts = [Start("nano", OURS, 0.2, 2**25)]
-    before = torch.get_num_threads()
+    before, starts = torch.get_num_threads(), [Start("nano", OURS, 0.2, 2**25)]
 
     def job():
+        runs = {OURS: double, "peer": double}
+        return peers.compare(case(), runs, INPUTS, 1e-4, targets=dict(peer=1e6))
+
+    def paced():
         assert torch.get_num_threads() == 2
         torch.set_num_threads(1)
         return camera
 
-    found = peers.run_suite("suite", [], 1.0, tmp_path, paced=[job], starts=[lambda: starts])
-    assert found == camera and torch.get_num_threads() == before
+    options = dict(paced=[paced], starts=[lambda: starts])
+    found = peers.run_suite("suite", [job, job], 1.0, tmp_path, **options)
+    assert [t for t in found if t.paced or t in camera] == camera
+    ours = [t.threads for t in found if t not in camera and t.name == "peer"]
+    assert ours == [1, 2] * 2 and torch.get_num_threads() == before
     (path,) = tmp_path.glob("suite--*.json")
-    assert Record.load(path).timings == camera and Record.load(path).starts == starts
+    assert Record.load(path).timings == found and Record.load(path).starts == starts
     printed = capsys.readouterr().out
+    assert "| `double` | ours (ms) | peer |" in printed and printed.count("MISSED") >= 4
     assert "p50 / p99 / CPU time, ms" in printed and "0.20 s, 32 MB" in printed
     assert printed.count("p50 over p99") == 4 and "MB 32.00 (target 60.00)" in printed

@@ -3,17 +3,7 @@ import itertools
 import pytest
 
 from darswin.bench import timing
-from darswin.bench.timing import (
-    DEFAULT,
-    OURS,
-    PACE,
-    Case,
-    Turn,
-    in_turns,
-    measure,
-    measure_paced,
-    summary,
-)
+from darswin.bench.timing import DEFAULT, OURS, PACE, Case, Turn, in_turns, measure, measure_paced
 
 
 @pytest.fixture
@@ -52,9 +42,7 @@ def test_each_candidate_runs_long_enough(taking):
     assert turns["slow"][1].seconds == pytest.approx([0.03] * 7)
     assert turns["slow"][1].cpu == pytest.approx(0.006)
     assert len(in_turns({"slow": taking(0.03)}, 0.01, least=9)["slow"]) == 9
-
-
-def test_short_timings_have_seven_turns_too(taking):
+    # Short timings have seven turns too.
     turns = in_turns({"slow": taking(0.1), "fast": taking(0.001)}, 0.07)
     assert [len(turn.seconds) for turn in turns["slow"]] == [1] * 7
     assert [len(turn.seconds) for turn in turns["fast"]] == [10] * 7
@@ -152,7 +140,7 @@ def test_summary():
     cpu = [3.0, 50.0, 4.0]
     both = {OURS: ours, "reference": turns}
     both = {name: [Turn(*turn) for turn in zip(of, cpu, strict=True)] for name, of in both.items()}
-    found = summary(case, "reference", both)
+    found = timing.summary(case, "reference", both)
     assert found.label == case.label and found.runs == 201
     assert (found.median, found.p99) == (100.0, 198.0)
     assert found.iqr == 99.0 and found.cpu == 4.0

@@ -177,7 +177,6 @@ def check_export(arguments: list[str], monkeypatch) -> None:
 
 def check_study(arguments: list[str], monkeypatch) -> None:
     """Its own options are read as it reads them, the others as `darswin fit` does."""
-    assert arguments[0] in ("studies/study.py", "studies/dense.py")
     program, asked = importlib.import_module(Path(arguments[0]).stem), []
     monkeypatch.setattr(program, "run_all", lambda _, jobs, *rest: asked.extend(jobs) or [])
     monkeypatch.setattr(program, "collect", lambda *results: None)
@@ -212,31 +211,18 @@ def check_frame(arguments: list[str], monkeypatch) -> None:
     assert frames.Network(network)(cv2.imread(picture)[..., ::-1]).ndim == 1
 
 
-def write_rooms(arguments: list[str], monkeypatch) -> None:
-    """Runs the program that the page names, for a few pictures."""
-    monkeypatch.setattr(sys, "argv", [*arguments, "--count", "12"])
-    runpy.run_path(arguments[0], run_name="__main__")
-
-
-def render_boards(arguments: list[str], monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", arguments)
-    runpy.run_path(arguments[0], run_name="__main__")
-
-
-def classify_video(arguments: list[str], monkeypatch) -> None:
-    """Runs the program with a video of the camera, and the files that the page wrote."""
-    write_video(Path(arguments[1]), count=3, size=(966, 1280))
-    monkeypatch.setattr(sys, "argv", arguments)
-    runpy.run_path(arguments[0], run_name="__main__")
-
-
 def run_program(arguments: list[str], monkeypatch) -> None:
-    studies = dict.fromkeys(("studies/study.py", "studies/dense.py"), check_study)
-    known = studies | {
-        "examples/camera.py": classify_video, "examples/rooms.py": write_rooms,
-        "studies/calibrate_boards.py": render_boards,
-    }  # fmt: skip
-    known[arguments[0]](arguments, monkeypatch)
+    """Runs the program that the page names, on a few pictures or on a video of the camera."""
+    program = arguments[0]
+    if program in ("studies/study.py", "studies/dense.py"):
+        check_study(arguments, monkeypatch)
+        return
+    assert program in ("examples/camera.py", "examples/rooms.py", "studies/calibrate_boards.py")
+    if program == "examples/camera.py":
+        write_video(Path(arguments[1]), count=3, size=(966, 1280))
+    few = ["--count", "12"] if program == "examples/rooms.py" else []
+    monkeypatch.setattr(sys, "argv", [*arguments, *few])
+    runpy.run_path(program, run_name="__main__")
 
 
 PROGRAMS: dict[str, Callable] = {
@@ -255,10 +241,8 @@ PROGRAMS: dict[str, Callable] = {
 def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
     scope: dict = {}
     for block in blocks(ROOT / "docs/howto/use.md"):
-        if block.language == "python":
+        if block.language == "python" and "polar" not in scope:
             run_python(block.text, scope)
-        if "polar" in scope:
-            break
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
 
 

@@ -154,10 +154,22 @@ def test_pixels_that_were_sampled_already_give_the_same_results(case):
                 sampled = net.sample(pixels, prepared)
                 assert sampled.dtype == torch.float32
                 assert_close(net.run_sampled(sampled, prepared, pixels), net.run(pixels, prepared))
+    prepared, expected = model.prepare(lenses, size), model(images, lenses)
+    sampled = model.sample(images, prepared)
+    for dtype in (torch.int32, torch.float16, torch.float64, torch.bfloat16):
+        if model.view.in_pixels or dtype in (torch.int32, torch.float16):
+            with pytest.raises(TypeError, match=rf"sampled must be .*, got {dtype}"):
+                model.run_sampled(sampled.to(dtype), prepared, images)
+        else:
+            assert_close(model.run_sampled(sampled.to(dtype), prepared, images), expected, 0.1)
+    if model.view.in_pixels:  # such as a camera's undistorted frames
+        frames = torch.randint(256, sampled.shape, dtype=torch.uint8)
+        expected = model.run_sampled(model.view.normalized(frames, torch.float32), prepared)
+        assert_equal(model.run_sampled(frames, prepared), expected)
     if "darswin" in case and "unet" not in case:
         assert sampled.shape == (2, 8, 32, 4 * 4 * 3)
         expected, double = model.run_sampled(sampled, prepared), copy.deepcopy(model).double()
-        got = double.run_sampled(sampled, double.prepare(lens.to(torch.float64), size))
+        got = double.run_sampled(sampled, double.prepare(lenses.to(torch.float64), size))
         assert_close(tensors_of(got), [t.double() for t in tensors_of(expected)])
 
 
@@ -167,8 +179,6 @@ def test_errors_of_pixels_that_were_sampled_already():
     sampled = model.sample(images, prepared)
     with pytest.raises(ValueError, match=r"sampled must have shape .* = \(any, 8, 32, 48\), got"):
         model.run_sampled(sampled[..., :-1], prepared)
-    with pytest.raises(TypeError, match=r"sampled must be .*, got torch.uint8"):
-        model.run_sampled(sampled.byte(), prepared)
     with pytest.raises(ValueError, match="one for each of the 1 images, got 2"):
         model.run_sampled(sampled[:1], prepared)
     dense, images, lenses = made("darswin_unet_a_nano")
@@ -203,25 +213,6 @@ def test_a_preparation_without_gradients_is_refused_in_training(case):
             model.get_parameter(name).requires_grad_(False)
         run(prepared)
         model.requires_grad_(True).eval()
-
-
-@torch.no_grad()
-@cases
-def test_the_dtype_of_pixels_that_were_sampled_already(case):
-    model, images, lenses = made(case, mean=MEAN, std=STD)
-    prepared = model.prepare(lenses, tuple(images.shape[2:]))
-    sampled = model.sample(images, prepared)
-    for dtype in (torch.int32, torch.float16, torch.float64, torch.bfloat16):
-        if model.view.in_pixels or dtype in (torch.int32, torch.float16):
-            with pytest.raises(TypeError, match=rf"sampled must be .*, got {dtype}"):
-                model.run_sampled(sampled.to(dtype), prepared, images)
-        else:
-            found = model.run_sampled(sampled.to(dtype), prepared, images)
-            assert_close(found, model.run(images, prepared), 0.1)
-    if model.view.in_pixels:  # such as a camera's undistorted frames
-        frames = torch.randint(256, sampled.shape, dtype=torch.uint8)
-        expected = model.run_sampled(model.view.normalized(frames, torch.float32), prepared)
-        assert_equal(model.run_sampled(frames, prepared), expected)
 
 
 OPTIONS = [

@@ -66,13 +66,6 @@ def test_ten_thousand_calls_of_several_threads_have_the_same_bits(threads):
         assert sum(pool.map(caller, range(4))) == 10_000
 
 
-def run(code: str) -> None:
-    """Runs the code after `SAMPLE` in a new process, which must end well."""
-    command = [sys.executable, "-c", SAMPLE + code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-
-
 SAMPLE = """
 import os, signal, threading, time
 import torch
@@ -90,7 +83,6 @@ def check(threads):
     assert (sample(threads).numpy() == expected.numpy()).all()
     assert threads == 1 or len(os.listdir("/proc/self/task")) > 1
 """
-linux = pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
 
 FORK = """
 def forked(work):
@@ -121,26 +113,12 @@ check(3)
 """
 
 
-@pytest.mark.slow
-@pytest.mark.unsanitized
-@linux
-def test_a_fork_has_threads_of_its_own():
-    run(FORK)
-
-
 POOL = """
 import multiprocessing
 check(2)
 with multiprocessing.get_context("fork").Pool(2) as pool:
     pool.map(check, [1, 2, 3] * 4)
 """
-
-
-@pytest.mark.slow
-@pytest.mark.unsanitized
-@linux
-def test_forked_processes_of_multiprocessing_use_threads():
-    run(POOL)
 
 
 SLEEP = """
@@ -156,10 +134,24 @@ while set(states()) != {"S"}:
 """
 
 
+unsanitized = pytest.mark.unsanitized
+
+
 @pytest.mark.slow
-@linux
-def test_helpers_without_work_sleep():
-    run(SLEEP)
+@pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(FORK, id="a fork has threads of its own", marks=unsanitized),
+        pytest.param(POOL, id="forks of multiprocessing", marks=unsanitized),
+        pytest.param(SLEEP, id="helpers without work sleep"),
+    ],
+)
+def test_a_process_ends_well(code):
+    done = subprocess.run(
+        [sys.executable, "-c", SAMPLE + code], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

@@ -71,12 +71,7 @@ def options(frames, scenes, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "kills"),
-    [
-        ("digits", (8, 9)),
-        pytest.param("frames", (5, 6), marks=pytest.mark.slow),
-        pytest.param("labels", (4, 4), marks=pytest.mark.slow),
-        pytest.param("distances", (4, 4), marks=pytest.mark.slow),
-    ],
+    [("digits", (8, 9)), ("frames", (5, 6)), ("labels", (4, 4)), ("distances", (4, 4))],
 )
 def test_a_killed_run_goes_on_bit_for_bit(options, tmp_path, monkeypatch, data, kills):
     fit(tmp_path / "whole", *options[data])
@@ -89,10 +84,8 @@ def test_a_killed_run_goes_on_bit_for_bit(options, tmp_path, monkeypatch, data, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", ["digits", pytest.param("labels", marks=pytest.mark.slow)])
-def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(
-    options, tmp_path, monkeypatch, data
-):
+@pytest.mark.parametrize("data", ["digits", "labels"])
+def test_with_lightnings_device_a_gpu_all_is_the_same(options, tmp_path, monkeypatch, data):
     few = [*options[data], "--trainer.max_steps", "2", "--data.workers", "1"]
     fit(tmp_path / "cpu", *few)
     # What Lightning makes the default device as it calls `configure_model`.

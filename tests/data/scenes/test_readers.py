@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from itertools import chain
 
 import cv2
@@ -35,6 +36,14 @@ INFO = "semantic_annotations/seg_annotation_info.json"
 
 def names(scenes):
     return [scenes.file(k).stem for k in range(len(scenes))]
+
+
+def refused(folder, message, split="train", target="labels", error=ValueError, **options):
+    with pytest.raises(error, match=message):
+        open_scenes(folder, split, target, **options)
+
+
+missing = partial(refused, error=FileNotFoundError)
 
 
 def lenses_of(scenes):
@@ -93,8 +102,7 @@ def test_woodscape_without_its_file_of_classes_and_with_lists(tmp_path):
         scenes = open_scenes(tmp_path, "train", "labels", splits=lists)
     assert scenes.classes == WOODSCAPE_INFO["class_names"] and scenes.colors == []
     assert names(scenes) == ["00000_FV", "00001_RV", "00005_RV"]
-    with pytest.raises(FileNotFoundError, match=r"1 pictures for 'test' .* not in .*08234_FV"):
-        open_scenes(tmp_path, "test", "labels", splits=lists)
+    missing(tmp_path, r"1 pictures for 'test' .* not in .*08234_FV", split="test", splits=lists)
     # As fishi's splits.json: stems.
     parts = {"train": ["00003_MVR"], "val": ["00004_FV"], "test": ["00006_MVL"]}
     file.write_text(json.dumps(parts))
@@ -111,8 +119,7 @@ def test_the_split_of_heal_swin(tmp_path):
     write_woodscape(tmp_path, 10)
     parts = [open_scenes(tmp_path, part, "labels", splits="heal-swin") for part in ("train", "val")]
     assert [len(part) for part in parts] == [9, 1]
-    with pytest.raises(FileNotFoundError, match=r"named splits: \['heal-swin'\]"):
-        open_scenes(tmp_path, "train", "labels", splits="omnidet")
+    missing(tmp_path, r"named splits: \['heal-swin'\]", splits="omnidet")
 
 
 def test_synwoodscape(tmp_path):
@@ -149,21 +156,14 @@ def test_kitti360(tmp_path):
     drives = [{part.file(k).parts[-4] for k in range(len(part))} for part in parts]
     assert [len(part) for part in parts] == [4, 4, 4] and not drives[0] & drives[1]
     assert len(lenses_of(parts[0])) == 4
-    with pytest.raises(
-        ValueError, match="looks like KITTI-360, whose fisheye pictures have no labels"
-    ):
-        open_scenes(tmp_path, "train", "labels")
+    refused(tmp_path, "looks like KITTI-360, whose fisheye pictures have no labels")
     (tmp_path / "calibration" / "image_03.yaml").unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"no lens for .*: add .*image_03\.yaml, or give `lens`"
-    ):
-        open_scenes(tmp_path, "train", "distance")
+    missing(tmp_path, r"no lens for .*: add .*image_03\.yaml, or give `lens`", target="distance")
 
 
 def test_cityscapes(tmp_path):
     write_cityscapes(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no lens\.json in .*, or give `lens`"):
-        open_scenes(tmp_path, "train", "labels")
+    missing(tmp_path, r"no lens\.json in .*, or give `lens`")
     shutil.copy(WOODSCAPE, tmp_path / "lens.json")
     scenes = open_scenes(tmp_path, "train", "labels")
     assert names(scenes) == [f"aachen_{k:06d}_000019_leftImg8bit" for k in range(3)]
@@ -175,51 +175,32 @@ def test_cityscapes(tmp_path):
     assert (scenes[0].target[ids == 0] == IGNORE).all()
     for split in ("val", "test"):  # the labels of "test" are withheld
         assert names(open_scenes(tmp_path, split, "labels")) == ["lindau_000000_000019_leftImg8bit"]
-    with pytest.raises(ValueError, match="looks like Cityscapes, which has labels but no"):
-        open_scenes(tmp_path, "train", "distance")
+    refused(tmp_path, "looks like Cityscapes, which has labels but no", target="distance")
     (tmp_path / "two.txt").write_text("road\nother\n")
-    with pytest.raises(ValueError, match=r"two\.txt must name 19 classes, but names 2"):
-        open_scenes(tmp_path, "train", "labels", classes=tmp_path / "two.txt")
+    refused(tmp_path, r"two\.txt must name 19 classes, but names 2", classes=tmp_path / "two.txt")
 
 
 @pytest.mark.parametrize(
-    ("ending", "message"),
-    [
-        ("_gtFine_labelTrainIds", r"but they end in \['_gtFine_labelTrainIds'\]"),
-        ("_gtFine_color", r"\['_gtFine_color'\]"),
-        ("_gtFine_instanceIds", r"\['_gtFine_instanceIds'\]"),
-        ("_gtCoarse_labelIds", r"\['_gtCoarse_labelIds'\]"),
-        ("_labelIds", r"\['_labelIds'\]"),
-        ("", r"\[''\]"),
-    ],
-)
-def test_other_endings_of_cityscapes_are_named(tmp_path, ending, message):
+    "ending",
+    ["_gtFine_labelTrainIds", "_gtFine_color", "_gtFine_instanceIds", "_gtCoarse_labelIds",
+     "_labelIds", ""],
+)  # fmt: skip
+def test_other_endings_and_folders_of_cityscapes_are_named(tmp_path, ending):
     write_cityscapes(tmp_path)
     shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    (tmp_path / "gtFine").rename(tmp_path / "gtCoarse")
+    missing(tmp_path, r"no folder .*gtFine/train: .*leftImg8bit/train")
+    (tmp_path / "gtCoarse").rename(tmp_path / "gtFine")
     for file in (tmp_path / "gtFine").rglob("*.png"):
         if file.stem.endswith("instanceIds"):
             file.unlink()
         else:
             file.rename(file.with_name(file.name.replace("_gtFine_labelIds", ending)))
-    with pytest.raises(
-        FileNotFoundError, match=rf"gtFine/train must hold .* end in _gtFine_labelIds, .*{message}"
-    ):
-        open_scenes(tmp_path, "train", "labels")
-
-
-def test_cityscapes_without_labels_or_pictures(tmp_path):
-    write_cityscapes(tmp_path)
-    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
-    (tmp_path / "gtFine").rename(tmp_path / "gtCoarse")
-    with pytest.raises(FileNotFoundError, match=r"no folder .*gtFine/train: .*leftImg8bit/train"):
-        open_scenes(tmp_path, "train", "labels")
-    (tmp_path / "gtCoarse").rename(tmp_path / "gtFine")
+    words = rf"hold .* end in _gtFine_labelIds, .*but they end in \['{ending}'\]"
+    missing(tmp_path, f"gtFine/train must {words}")
     for file in (tmp_path / "leftImg8bit").rglob("*.png"):
         file.rename(file.with_name(file.name.replace("leftImg8bit", "rightImg8bit")))
-    with pytest.raises(
-        FileNotFoundError, match=r"leftImg8bit/train must hold .*_leftImg8bit, .*_rightImg8bit"
-    ):
-        open_scenes(tmp_path, "train", "labels")
+    missing(tmp_path, r"leftImg8bit/train must hold .*_leftImg8bit, .*_rightImg8bit")
 
 
 def test_coco_panoptic(tmp_path):
@@ -242,12 +223,8 @@ def test_coco_panoptic(tmp_path):
         ("[]", r"must be a JSON object, got \["),
     ):
         file.write_text(text)
-        with pytest.raises(
-            ValueError, match=rf"json is not in COCO's panoptic format: .*{message}"
-        ):
-            open_scenes(tmp_path, "train", "labels")
-    with pytest.raises(ValueError, match="looks like COCO panoptic, which has labels but no"):
-        open_scenes(tmp_path, "train", "distance")
+        refused(tmp_path, rf"json is not in COCO's panoptic format: .*{message}")
+    refused(tmp_path, "looks like COCO panoptic, which has labels but no", target="distance")
 
 
 def annotated(folder, change):
@@ -267,18 +244,12 @@ def annotated(folder, change):
 @pytest.mark.parametrize(
     ("place", "file_name", "is_found"),
     [
-        ("a/b", "a/b/{}", True),
-        ("a/b", "./a//b/{}", True),
-        ("a/b", r"a\b\{}", True),
-        ("a/b", "panoptic_train2017/a/b/{}", True),
-        ("b", "a/b/{}", True),
-        (".", "a/b/{}", True),
-        (".", "{}", True),
-        ("a/b", "b/{}", False),
-        ("a/b", "{}", False),
-        ("a/b", "a/c/{}", False),
+        *(("a/b", name, True)
+          for name in ("a/b/{}", "./a//b/{}", r"a\b\{}", "panoptic_train2017/a/b/{}")),
+        ("b", "a/b/{}", True), (".", "a/b/{}", True), (".", "{}", True),
+        *(("a/b", name, False) for name in ("b/{}", "{}", "a/c/{}")),
     ],
-)
+)  # fmt: skip
 def test_folders_in_coco(tmp_path, place, file_name, is_found):
     expected = annotated(tmp_path, lambda first, content: None)[0].target
     for folder in ("train2017", "annotations/panoptic_train2017"):
@@ -455,25 +426,26 @@ def test_wrong_label_maps_are_named(tmp_path):
         ({"0": "sky", "00": "sea"}, "maps the id 0 twice"),
     ):
         file.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match=message):
-            open_scenes(tmp_path, "all", "labels", label_map=file)
+        refused(tmp_path, message, split="all", label_map=file)
     (tmp_path / "mine.txt").write_text("sky\nsea\n")
     file.write_text(json.dumps({"0": "sky", "1": "land"}))
-    with pytest.raises(ValueError, match="maps the id 1 to 'land', but the classes are"):
-        open_scenes(tmp_path, "all", "labels", label_map=file, classes=tmp_path / "mine.txt")
+    refused(
+        tmp_path,
+        "maps the id 1 to 'land', but the classes are",
+        split="all",
+        label_map=file,
+        classes=tmp_path / "mine.txt",
+    )
 
 
 def test_what_woodscape_does_not_have(tmp_path):
     write_woodscape(tmp_path, 4)
-    with pytest.raises(ValueError, match="looks like WoodScape, which has labels but no"):
-        open_scenes(tmp_path, "train", "distance")
+    refused(tmp_path, "looks like WoodScape, which has labels but no", target="distance")
     (tmp_path / "calibration" / "calibration" / "00002_MVL.json").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no lens for .*00002_MVL\.png: add .*00002_MVL"):
-        open_scenes(tmp_path, "all", "labels")
+    missing(tmp_path, r"no lens for .*00002_MVL\.png: add .*00002_MVL", split="all")
     lens = tmp_path / "calibration" / "calibration" / "00000_FV.json"
     (tmp_path / INFO).write_text(json.dumps(WOODSCAPE_INFO | {"class_indexes": [1] * 10}))
-    with pytest.raises(ValueError, match=r"seg_annotation_info\.json: class_indexes must be"):
-        open_scenes(tmp_path, "all", "labels", lens=lens)
+    refused(tmp_path, r"seg_annotation_info\.json: class_indexes must be", split="all", lens=lens)
 
 
 @pytest.mark.parametrize(
@@ -489,8 +461,7 @@ def test_outlines_of_objects_are_no_labels(tmp_path, place, pictures):
         (tmp_path / "images").rename(tmp_path / pictures)
     file.parent.mkdir(exist_ok=True)
     (tmp_path / "annotations" / "instances_train.json").rename(file)
-    with pytest.raises(FileNotFoundError, match=rf"{file.name} has outlines .* docs/howto/scenes"):
-        open_scenes(tmp_path, "train", "labels")
+    missing(tmp_path, rf"{file.name} has outlines .* docs/howto/scenes")
 
 
 # -- the plain form ---------------------------------------------------------------------------
@@ -498,8 +469,7 @@ def test_outlines_of_objects_are_no_labels(tmp_path, place, pictures):
 
 def test_plain_folders_of_splits(tmp_path):
     write_plain(tmp_path, 2, split="test")
-    with pytest.raises(FileNotFoundError, match=r"there are \['test'\] pictures, but none for"):
-        open_scenes(tmp_path, "train", "labels")
+    missing(tmp_path, r"there are \['test'\] pictures, but none for")
     write_plain(tmp_path, 10, split="train")
     parts = [names(open_scenes(tmp_path, part, "labels")) for part in ("train", "val", "test")]
     assert [len(part) for part in parts] == [9, 1, 2] and not set(parts[0]) & set(parts[1])
@@ -521,8 +491,7 @@ def test_plain_folders_of_splits(tmp_path):
         with pytest.raises(ValueError, match=message):
             open_scenes(tmp_path, target="labels", **options)
     write_plain(tmp_path, 1)
-    with pytest.raises(ValueError, match="has both"):
-        open_scenes(tmp_path, "train", "labels")
+    refused(tmp_path, "has both")
 
 
 def test_hold_out_of_one_folder(tmp_path):
@@ -530,8 +499,7 @@ def test_hold_out_of_one_folder(tmp_path):
     parts = [names(open_scenes(tmp_path, p, "labels")) for p in ("train", "val", "test")]
     assert [len(part) for part in parts] == [16, 2, 2]
     assert sorted(chain(*parts)) == names(open_scenes(tmp_path, "all", "labels"))
-    with pytest.raises(FileNotFoundError, match="`holdout` 0 of 20 pictures leaves none"):
-        open_scenes(tmp_path, "test", "labels", holdout=0)
+    missing(tmp_path, "`holdout` 0 of 20 pictures leaves none", split="test", holdout=0)
 
 
 @pytest.mark.filterwarnings("ignore::darswin.data.splits.LeftOut")
@@ -561,8 +529,7 @@ def test_lenses_of_pictures(tmp_path):
     lenses = lenses_of(open_scenes(tmp_path, "all", "labels"))  # two forms: as curves
     assert lenses[3].theta_max.item() == pytest.approx(1.2) and len(lenses) == 6
     own.unlink()
-    with pytest.raises(FileNotFoundError, match=r"no lens for .*003\.png: add .*lenses/003\.json"):
-        open_scenes(tmp_path, "all", "labels")
+    missing(tmp_path, r"no lens for .*003\.png: add .*lenses/003\.json", split="all")
     shared = {"images": {"model": "Equidistant", "focal": 40.0, "theta_max": 1.1}}
     (tmp_path / "lens.json").write_text(json.dumps(shared))
     scenes = open_scenes(tmp_path, "all", "labels")
@@ -576,8 +543,7 @@ def test_lenses_of_pictures(tmp_path):
         (json.dumps(tangential | {"theta_max": 0.8}), "cameras of several lens models"),
     ):
         own.write_text(text)
-        with pytest.raises(ValueError, match=rf"003\.json: {message}"):
-            open_scenes(tmp_path, "all", "labels")
+        refused(tmp_path, rf"003\.json: {message}", split="all")
 
 
 @pytest.mark.parametrize("name", ["lens.yaml", "lens.YML", "lens.xml", "lens.txt", "lens.json"])
@@ -593,18 +559,14 @@ def test_a_calibration_beside_the_pictures(tmp_path, name):
     scenes = open_scenes(tmp_path, "all", "labels")
     assert scenes[1].lens.focal.item() == pytest.approx(2 * scenes[0].lens.focal.item())
     (tmp_path / "lens.npz").touch()
-    with pytest.raises(ValueError, match="are both calibrations: keep one"):
-        open_scenes(tmp_path, "all", "labels")
+    refused(tmp_path, "are both calibrations: keep one", split="all")
 
 
 def test_a_camera_of_the_calibration_beside_the_pictures(tmp_path):
     write_plain(tmp_path, 2)
     (tmp_path / "lens.json").unlink()
     shutil.copy(WOODSCAPE.parent / "kalibr_fov.yaml", tmp_path / "lens.yaml")
-    with pytest.raises(
-        ValueError, match=r"lens\.yaml: it has several cameras, choose one with `camera`"
-    ):
-        open_scenes(tmp_path, "all", "labels")
+    refused(tmp_path, r"lens\.yaml: it has several cameras, choose one with `camera`", split="all")
     lenses = [open_scenes(tmp_path, "all", "labels", camera=f"cam{k}").lenses for k in range(2)]
     assert str(lenses[0].lens_alone(None)) != str(lenses[1].lens_alone(None))
 
@@ -612,8 +574,7 @@ def test_a_camera_of_the_calibration_beside_the_pictures(tmp_path):
 def test_missing_labels_and_pictures_are_named(tmp_path):
     write_plain(tmp_path, 4)
     (tmp_path / "labels" / "002.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no labels for 1 of 4 .*images/002\.png"):
-        open_scenes(tmp_path, "all", "labels")
+    missing(tmp_path, r"no labels for 1 of 4 .*images/002\.png", split="all")
     assert len(open_scenes(tmp_path, "all", "distance")) == 4
     (tmp_path / "images" / "003.png").rename(tmp_path / "images" / "003.gif")
     file = tmp_path / "splits.json"
@@ -624,18 +585,14 @@ def test_missing_labels_and_pictures_are_named(tmp_path):
     assert "1 files of labels have no picture" in text
     assert "pictures that darswin does not read, 1 .gif" in text
     (tmp_path / "distance" / "001.npy").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"001\.npy and .*001\.png have the same stem"):
-        open_scenes(tmp_path, "all", "distance")
+    refused(tmp_path, r"001\.npy and .*001\.png have the same stem", split="all", target="distance")
 
 
 def test_what_is_no_data_set(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no scenes in .*: darswin looks for images/STEM"):
-        open_scenes(tmp_path, "train", "labels")
-    with pytest.raises(FileNotFoundError, match="no folder"):
-        open_scenes(tmp_path / "x", "train", "labels")
+    missing(tmp_path, r"no scenes in .*: darswin looks for images/STEM")
+    missing(tmp_path / "x", "no folder")
     for wrong in (dict(split="x"), dict(target="x"), dict(channels=2), dict(holdout=0.5)):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))}`? must be"):
             open_scenes(**dict(path=tmp_path, split="train", target="labels") | wrong)
     write_plain(tmp_path, 1, own_lenses=True)
-    with pytest.raises(ValueError, match="`camera` a needs a calibration: give `lens` too"):
-        open_scenes(tmp_path, "all", "labels", camera="a")
+    refused(tmp_path, "`camera` a needs a calibration: give `lens` too", split="all", camera="a")
