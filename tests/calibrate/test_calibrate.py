@@ -330,10 +330,9 @@ def test_uncertainty_grows_where_no_corner_was_seen(usual):
 
 
 def test_a_wrong_model_ends_in_words(usual):
-    with pytest.raises(
-        CalibrationError, match=r"The corners reach 9\d° from the axis, but a Persp"
-    ):
-        of(usual, "Perspective")
+    pytest.raises(CalibrationError, of, usual, "Perspective").match(
+        r"The corners reach 9\d° from the axis, but a Persp"
+    )
 
 
 @pytest.mark.slow

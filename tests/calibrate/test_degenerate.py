@@ -76,17 +76,13 @@ def test_errors(case):
     assert str(caught.value).count("\n") == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("corners", BOARD, SIZE), "`corners` must be numbers"),
-        ((CORNERS, None, SIZE), "`board` must be numbers"),
-        ((CORNERS, BOARD, SIZE, 3), "model must be a lens class or its name"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("corners", BOARD, SIZE), "`corners` must be numbers"),
+    ((CORNERS, None, SIZE), "`board` must be numbers"),
+    ((CORNERS, BOARD, SIZE, 3), "model must be a lens class or its name"),
+])  # fmt: skip
 def test_wrong_types(arguments, words):
-    with pytest.raises(TypeError, match=words):
-        calibrate(*arguments)
+    pytest.raises(TypeError, calibrate, *arguments).match(words)
 
 
 @pytest.mark.parametrize("size", [960, (960,), (960.5, 1000), (0, 1000), "AB"])

@@ -135,8 +135,7 @@ def test_straightness_alone_does_not_tell_the_focal_length():
     """Lines of one direction: a lens is refused, unless the field of view is known."""
     lens = LENSES["stereographic"]
     curves = [curves_of(lens, seed, axes=1, askew=0) for seed in (1, 2, 3)]
-    with pytest.raises(CalibrationError, match="do not tell the focal length"):
-        from_curves(curves, SIZE)
+    pytest.raises(CalibrationError, from_curves, curves, SIZE).match("do not tell the focal length")
     circle = (319.5, 239.5, 240.0)
     found = from_curves(curves, SIZE, circle=circle, fov=2 * rim_of(lens))
     assert found.rim == pytest.approx(rim_of(lens), rel=2e-3)
@@ -201,12 +200,11 @@ def test_an_interval_holds_the_truth_in_two_cases_of_three():
     assert sum(miss <= 1 for miss in misses) >= 8 and max(misses) < 3
 
 
-@pytest.mark.parametrize(
-    ("of_second", "askew", "doubt"),
-    [(15, 6, None), (4, 0, "only 4 lines of a picture have a second direction"),
-     pytest.param(12, 80, "of the lines agree with orthogonal directions",
-                  marks=pytest.mark.slow)],
-)  # fmt: skip
+@pytest.mark.parametrize(("of_second", "askew", "doubt"), [
+    (15, 6, None), (4, 0, "only 4 lines of a picture have a second direction"),
+    pytest.param(12, 80, "of the lines agree with orthogonal directions",
+                 marks=pytest.mark.slow),
+])  # fmt: skip
 def test_few_orthogonal_lines_are_a_doubt(of_second, askew, doubt):
     lens = LENSES["equidistant"]
     curves = curves_of(lens, 3, 15, axes=1, bent=0, askew=askew)
@@ -238,8 +236,7 @@ def test_too_little_evidence_is_refused_in_one_sentence():
 def test_no_lens_at_all_is_no_answer(monkeypatch):
     curves = [curves_of(LENSES["equisolid"], 1)]
     monkeypatch.setattr(lines, "NARROWEST", from_curves(curves, SIZE).rim + 0.1)
-    with pytest.raises(CalibrationError, match="do not determine a lens"):
-        from_curves(curves, SIZE)
+    pytest.raises(CalibrationError, from_curves, curves, SIZE).match("do not determine a lens")
 
 
 def test_an_interval_has_only_angles_of_lenses(monkeypatch):
@@ -254,22 +251,18 @@ def test_nothing_of_an_estimate_is_random():
     assert_same(*(from_curves(curves, SIZE) for _ in range(2)))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"pictures": []}, "one size .* got no pictures"),
-        ({"pictures": [np.zeros((20, 30), np.uint8), np.zeros((30, 20), np.uint8)]},
-         "got 30 × 20, 20 × 30"),
-        ({"model": "Sphere"}, "unknown lens model 'Sphere'"),
-        ({"fov": 7.0}, "`fov` must be above 0 and below 2π, got 7"),
-        ({"fov": 2.0}, "no image circle is visible"),
-        ({}, "only 0 curves may be straight lines"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"pictures": []}, "one size .* got no pictures"),
+    ({"pictures": [np.zeros((20, 30), np.uint8), np.zeros((30, 20), np.uint8)]},
+     "got 30 × 20, 20 × 30"),
+    ({"model": "Sphere"}, "unknown lens model 'Sphere'"),
+    ({"fov": 7.0}, "`fov` must be above 0 and below 2π, got 7"),
+    ({"fov": 2.0}, "no image circle is visible"),
+    ({}, "only 0 curves may be straight lines"),
+])  # fmt: skip
 def test_wrong_arguments(arguments, message):
     given = {"pictures": [np.full((60, 80, 3), 90, np.uint8)]} | arguments
-    with pytest.raises(ValueError, match=message):
-        estimate(**given)
+    pytest.raises(ValueError, estimate, **given).match(message)
 
 
 @pytest.mark.parametrize("size", [(0, 0), (0, 20), (1, 1), (15, 40)])
@@ -281,5 +274,4 @@ def test_small_pictures_are_refused(size):
 @pytest.mark.parametrize("size", [(16, 16), (17, 40), (64, 64)])
 def test_noise_has_too_few_lines(size):
     noise = np.random.default_rng(0).integers(0, 256, size).astype(np.uint8)
-    with pytest.raises(CalibrationError, match="curves may be straight lines"):
-        estimate([noise])
+    pytest.raises(CalibrationError, estimate, [noise]).match("curves may be straight lines")

@@ -46,12 +46,9 @@ def test_indexing_and_joining():
     assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
     assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
     assert len(lens[0].expand(5)) == 5
-    with pytest.raises(ValueError, match="cannot expand"):
-        lens.expand(4)
-    with pytest.raises(ValueError, match="at least one"):
-        cat([])
-    with pytest.raises(ValueError, match="center for all"):
-        cat([lens[0], Spherical(0.1, 1.0, 1.0)])
+    pytest.raises(ValueError, lens.expand, 4).match("cannot expand")
+    pytest.raises(ValueError, cat, []).match("at least one")
+    pytest.raises(ValueError, cat, [lens[0], Spherical(0.1, 1.0, 1.0)]).match("center for all")
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -88,10 +85,9 @@ def test_pickle_copy_and_pytree(name):
 def test_a_column_of_coefficients_is_not_many_lenses():
     column = [[0.01], [0.002], [-0.001], [0.0003]]  # the shape of OpenCV's D
     for make in (lambda: KannalaBrandt(300.0, column), lambda: KannalaBrandt([300.0], column)):
-        with pytest.raises(
-            ValueError, match=r"radial of shape \(4, 1\) means 4 lenses with one coef"
-        ):
-            make()
+        pytest.raises(ValueError, make).match(
+            r"radial of shape \(4, 1\) means 4 lenses with one coef"
+        )
     assert len(KannalaBrandt([300.0] * 4, column)) == 4
     assert len(KannalaBrandt(300.0, [[0.01]])) == 1
 

@@ -21,17 +21,14 @@ D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 
 
 def test_paths(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load(tmp_path / "none.json")
+    pytest.raises(FileNotFoundError, load, tmp_path / "none.json")
     for path in (tmp_path, "/dev/zero"):
-        with pytest.raises(ValueError, match="it must be a file"):
-            load(path)
+        pytest.raises(ValueError, load, path).match("it must be a file")
     (tmp_path / "large").write_bytes(b" " * ((16 << 20) + 1))
     with pytest.raises(ValueError, match=r"calibration /.*large: it must be at most 16 MiB"):
         load(tmp_path / "large")
     (tmp_path / "latin").write_bytes("name: caf\xe9".encode("latin-1"))
-    with pytest.raises(ValueError, match=r"must be text in UTF-8: .* 0xe9"):
-        load(tmp_path / "latin")
+    pytest.raises(ValueError, load, tmp_path / "latin").match(r"must be text in UTF-8: .* 0xe9")
     marked = b"\xef\xbb\xbf" + FILES.joinpath("woodscape.json").read_bytes()
     (tmp_path / "marked").write_bytes(marked)
     assert load(tmp_path / "marked").r_max.item() > 600
@@ -46,11 +43,10 @@ ENCODINGS = {
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(
-    "name",
-    ["opencv_fisheye.yaml", "kalibr_ds.yaml", "kitti360_02.yaml", "woodscape.json", "ours.json",
-     "opencv_omnidir.xml", "ocamcalib.txt", "colmap.txt"],
-)  # fmt: skip
+@pytest.mark.parametrize("name", [
+    "opencv_fisheye.yaml", "kalibr_ds.yaml", "kitti360_02.yaml", "woodscape.json", "ours.json",
+    "opencv_omnidir.xml", "ocamcalib.txt", "colmap.txt",
+])  # fmt: skip
 def test_editors_of_other_systems_may_have_saved_a_calibration(name, encoding, tmp_path):
     path = tmp_path / name
     text = file_text(name)
@@ -58,9 +54,6 @@ def test_editors_of_other_systems_may_have_saved_a_calibration(name, encoding, t
         text = text.replace('version="1.0"', 'version="1.0" encoding="UTF-16"')
     path.write_bytes(ENCODINGS[encoding](text))
     assert to_dict(load(path, dtype=f64)) == to_dict(load(FILES / name, dtype=f64))
-
-
-# -- arrays of NumPy ---
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
@@ -78,8 +71,7 @@ def test_arrays_of_numpy(save, tmp_path):
     save(path, cameraMatrix=np.array(K), distCoeffs=np.array(FISHEYE)[:, None])
     assert load(path, coefficients="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
     save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
-    with pytest.raises(ValueError, match=r"D must be 0 or 4 or .*dtype', 'object'"):
-        load(path)
+    pytest.raises(ValueError, load, path).match(r"D must be 0 or 4 or .*dtype', 'object'")
 
 
 CLOSE = 1.15  # the middles of both orders are so close that only an exact one tells them apart
@@ -138,9 +130,6 @@ def test_arrays_of_objects_are_named(tmp_path):
     assert load(path).radial.tolist() == [pytest.approx(D[:4])]
 
 
-# -- many cameras, and many numbers ---
-
-
 def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
     rows = [f"{i} OPENCV_FISHEYE 640 480 {300 + i} 310 320 240 0.01 -0.002 0.0003 0\n"
             for i in range(9)]  # fmt: skip
@@ -154,8 +143,7 @@ def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
     for bad in (6, 8):
         rows[bad] = rows[bad].replace("310", "1e-300")
     path.write_text("".join(rows))
-    with pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '6': "):
-        load_all(path)
+    pytest.raises(ValueError, load_all, path).match(r"COLMAP calibration .*: camera '6': ")
     assert load(path, camera="5").focal.item() == 305
 
 

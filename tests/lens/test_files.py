@@ -33,26 +33,23 @@ from darswin.lens.files.load import Calibration
 from darswin.views import up_of
 
 
-@pytest.mark.parametrize(
-    ("name", "model", "center", "size"),
-    [
-        ("woodscape.json", "Polynomial", (640 + 1.8 - 0.5, 483 + 3.6 - 0.5), (966, 1280)),
-        ("kitti360_02.yaml", "Mei", (708.5, 697.0), (1400, 1400)),
-        ("camodocal_pinhole.yaml", "BrownConrady", (371.4, 236.2), (480, 752)),
-        ("kalibr_ds.yaml", "DoubleSphere", (724.6, 533.8), (1080, 1440)),
-        ("kalibr_omni.yaml", "Mei", (380.6, 243.5), (480, 752)),
-        ("ros_plumb_bob.yaml", "BrownConrady", (312.054718, 236.418205), (480, 640)),
-        ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
-        ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
-        ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
-        # The row comes first, and indices begin at 0.
-        ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
-        # The center of the upper left pixel is (0.5, 0.5).
-        ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
-        ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),
-        ("ours.json", "KannalaBrandt", (319.5, 241.0), (480, 640)),
-    ],
-)
+@pytest.mark.parametrize(("name", "model", "center", "size"), [
+    ("woodscape.json", "Polynomial", (640 + 1.8 - 0.5, 483 + 3.6 - 0.5), (966, 1280)),
+    ("kitti360_02.yaml", "Mei", (708.5, 697.0), (1400, 1400)),
+    ("camodocal_pinhole.yaml", "BrownConrady", (371.4, 236.2), (480, 752)),
+    ("kalibr_ds.yaml", "DoubleSphere", (724.6, 533.8), (1080, 1440)),
+    ("kalibr_omni.yaml", "Mei", (380.6, 243.5), (480, 752)),
+    ("ros_plumb_bob.yaml", "BrownConrady", (312.054718, 236.418205), (480, 640)),
+    ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
+    ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
+    ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
+    # The row comes first, and indices begin at 0.
+    ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
+    # The center of the upper left pixel is (0.5, 0.5).
+    ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
+    ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),
+    ("ours.json", "KannalaBrandt", (319.5, 241.0), (480, 640)),
+])  # fmt: skip
 def test_each_format_keeps_its_pixel_origin(name, model, center, size):
     lens = load(FILES / name, dtype=f64)
     assert type(lens).__name__ == model and len(lens) == 1
@@ -120,74 +117,71 @@ EIGHT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
 
 
-@pytest.mark.parametrize(
-    ("text", "options", "expected"),
-    [
-        *((EUROC.format(word), {}, RADTAN | SIZE)
-          for word in ("radial-tangential", "radial_tangential", "radtan")),
-        (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
-        *((opencv(**{name: PLUMB_BOB}), {}, PLUMB) for name in NAMES),
-        *((opencv(D=PLUMB_BOB, **says), {}, PLUMB)
-          for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0))),
-        *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
-        (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
-        # From NumPy scripts, and from the output of `rostopic echo` and `ros2 topic echo`.
-        (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
-        (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
-         f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
-        *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
-        (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
-         dict(model="Perspective", center=[255.5, 254.5])),
-        # A θ_max beyond the limit by rounding.
-        ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
-         dict(model="Equidistant", focal=300.0)),
-        # The choice of the model.
-        (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
-        (opencv(), dict(coefficients="fisheye"), dict(model="Equidistant")),
-        (fisheye_or_pinhole(), dict(coefficients="fisheye"), KB),
-        (fisheye_or_pinhole(), dict(coefficients="pinhole"), PINHOLE),
-        (fisheye_or_pinhole(fisheye_model=1), {}, KB),
-        (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
-        (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
-        (fisheye_or_pinhole(distortion_model="plumb_bob"), {}, PINHOLE),
-        (fisheye_or_pinhole(camera_model="fisheye"), {}, KB),
-        (fisheye_or_pinhole(xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-        (fisheye_or_pinhole(xi=[[1.1]]), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-        (fisheye_or_pinhole(xi=1.1, model="fisheye"), {}, KB),
-        (FISHEYES["Kalibr"](FISHEYE).replace("equidistant", "radtan"), {}, PINHOLE),
-        (opencv(D=[*PLUMB_BOB, 0, 0]), {}, PLUMB),
-        *((text(FISHEYE), {}, KB) for text in FISHEYES.values()),
-        # The size of the image in every form.
-        *((text, {}, SIZE) for entries in SIZES for text in (sized(**entries), single(**entries))),
-        (sized(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960]), {}, SIZE),
-        # The name decides where the principal point does not.
-        *((sized(K=[[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]], **{name: [1280, 1240]}), {},
-           dict(image_size=size)) for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0))
-          for name, size in (("img_size", [1240, 1280]), ("shape", [1280, 1240]))),
-        # Whether it is a fisheye in any word.
-        *((text, {}, dict(model=model)) for name in ("is_fisheye", "isFisheye", "fisheye")
-          for model, words in (("KannalaBrandt", ("True", "yes", 1, "1", "TRUE")),
-                               ("BrownConrady", ("no", "False", 0)))
-          for value in words
-          for text in (instant_ngp(**{"is_fisheye": None, name: value}),
-                       opencv(D=FISHEYE, **{name: value}))),
-        *((instant_ngp(is_fisheye=value, **entries), {}, dict(model=model))
-          for value, model in ((None, "BrownConrady"), (True, "KannalaBrandt"),
-                               (False, "BrownConrady"))
-          for off in (dict.fromkeys(other, 0) for other in OTHER_CAMERAS)
-          for entries in (off, off | dict(frames=[NGP["frames"][0] | off]))),
-        (instant_ngp(), {}, dict(model="KannalaBrandt", center=[803.0, 596.75],
-                                 radial=[0.0182, -0.0064, 0.0027, -0.0008])),
-        # Single numbers.
-        (flat("k1", "k2", "k3", "k4"), {}, KB | {"center": [643.1, 478.6], "focal": 421.3}),
-        (yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), {}, KB),
-        (flat("k1", "k2", "k3", model="fisheye"), {}, KB | dict(radial=[*FISHEYE[:3], 0.0])),
-        (flat("k1", "k2", "p1", "p2"), {}, PINHOLE | dict(radial=[*FISHEYE[:2], 0.0])),
-        (flat(**dict(zip(EIGHT, RATIONAL, strict=True))), {}, DIVIDED),
-        (flat("k1", "k2", "p1", "p2", fy=421.3, skew=421.3), {}, {"affine": [[1, 1], [0, 1]]}),
-        (flat("k1", "k2", "p1", "p2", xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "options", "expected"), [
+    *((EUROC.format(word), {}, RADTAN | SIZE)
+      for word in ("radial-tangential", "radial_tangential", "radtan")),
+    (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
+    *((opencv(**{name: PLUMB_BOB}), {}, PLUMB) for name in NAMES),
+    *((opencv(D=PLUMB_BOB, **says), {}, PLUMB)
+      for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0))),
+    *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
+    (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
+    # From NumPy scripts, and from the output of `rostopic echo` and `ros2 topic echo`.
+    (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
+    (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
+     f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
+    *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
+    (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
+     dict(model="Perspective", center=[255.5, 254.5])),
+    # A θ_max beyond the limit by rounding.
+    ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
+     dict(model="Equidistant", focal=300.0)),
+    # The choice of the model.
+    (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
+    (opencv(), dict(coefficients="fisheye"), dict(model="Equidistant")),
+    (fisheye_or_pinhole(), dict(coefficients="fisheye"), KB),
+    (fisheye_or_pinhole(), dict(coefficients="pinhole"), PINHOLE),
+    (fisheye_or_pinhole(fisheye_model=1), {}, KB),
+    (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
+    (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
+    (fisheye_or_pinhole(distortion_model="plumb_bob"), {}, PINHOLE),
+    (fisheye_or_pinhole(camera_model="fisheye"), {}, KB),
+    (fisheye_or_pinhole(xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+    (fisheye_or_pinhole(xi=[[1.1]]), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+    (fisheye_or_pinhole(xi=1.1, model="fisheye"), {}, KB),
+    (FISHEYES["Kalibr"](FISHEYE).replace("equidistant", "radtan"), {}, PINHOLE),
+    (opencv(D=[*PLUMB_BOB, 0, 0]), {}, PLUMB),
+    *((text(FISHEYE), {}, KB) for text in FISHEYES.values()),
+    # The size of the image in every form.
+    *((text, {}, SIZE) for entries in SIZES for text in (sized(**entries), single(**entries))),
+    (sized(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960]), {}, SIZE),
+    # The name decides where the principal point does not.
+    *((sized(K=[[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]], **{name: [1280, 1240]}), {},
+       dict(image_size=size)) for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0))
+      for name, size in (("img_size", [1240, 1280]), ("shape", [1280, 1240]))),
+    # Whether it is a fisheye in any word.
+    *((text, {}, dict(model=model)) for name in ("is_fisheye", "isFisheye", "fisheye")
+      for model, words in (("KannalaBrandt", ("True", "yes", 1, "1", "TRUE")),
+                           ("BrownConrady", ("no", "False", 0)))
+      for value in words
+      for text in (instant_ngp(**{"is_fisheye": None, name: value}),
+                   opencv(D=FISHEYE, **{name: value}))),
+    *((instant_ngp(is_fisheye=value, **entries), {}, dict(model=model))
+      for value, model in ((None, "BrownConrady"), (True, "KannalaBrandt"),
+                           (False, "BrownConrady"))
+      for off in (dict.fromkeys(other, 0) for other in OTHER_CAMERAS)
+      for entries in (off, off | dict(frames=[NGP["frames"][0] | off]))),
+    (instant_ngp(), {}, dict(model="KannalaBrandt", center=[803.0, 596.75],
+                             radial=[0.0182, -0.0064, 0.0027, -0.0008])),
+    # Single numbers.
+    (flat("k1", "k2", "k3", "k4"), {}, KB | {"center": [643.1, 478.6], "focal": 421.3}),
+    (yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), {}, KB),
+    (flat("k1", "k2", "k3", model="fisheye"), {}, KB | dict(radial=[*FISHEYE[:3], 0.0])),
+    (flat("k1", "k2", "p1", "p2"), {}, PINHOLE | dict(radial=[*FISHEYE[:2], 0.0])),
+    (flat(**dict(zip(EIGHT, RATIONAL, strict=True))), {}, DIVIDED),
+    (flat("k1", "k2", "p1", "p2", fy=421.3, skew=421.3), {}, {"affine": [[1, 1], [0, 1]]}),
+    (flat("k1", "k2", "p1", "p2", xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+])  # fmt: skip
 def test_what_is_read(text, options, expected):
     described = to_dict(loads(text, dtype=f64, **options))
     assert described | expected == described
@@ -275,15 +269,12 @@ def test_up_of_a_vehicles_camera_is_that_of_its_rotation(name):
     assert up[1] < -0.5 and np.linalg.norm(up) == pytest.approx(1)  # the camera stands upright
 
 
-@pytest.mark.parametrize(
-    ("extrinsic", "said"),
-    [
-        (dict(quaternion=[0, 0, 0, 0]), "extrinsic.quaternion must not be zero"),
-        (dict(quaternion=[0, 0, 1]), r"extrinsic\.quaternion must be .*4"),
-        (dict(), "quaternion"),
-        (None, "extrinsic"),
-    ],
-)
+@pytest.mark.parametrize(("extrinsic", "said"), [
+    (dict(quaternion=[0, 0, 0, 0]), "extrinsic.quaternion must not be zero"),
+    (dict(quaternion=[0, 0, 1]), r"extrinsic\.quaternion must be .*4"),
+    (dict(), "quaternion"),
+    (None, "extrinsic"),
+])  # fmt: skip
 def test_files_that_do_not_say_what_is_up(tmp_path, extrinsic, said):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(json.loads(file_text("woodscape.json")) | dict(extrinsic=extrinsic)))
@@ -292,9 +283,6 @@ def test_files_that_do_not_say_what_is_up(tmp_path, extrinsic, said):
     assert str(path) in str(error.value)
     with pytest.raises(ValueError, match="Kalibr files do not say which way is up"):
         load_up(FILES / "kalibr_tumvi.yaml")
-
-
-# -- missing information ------------------------------------------------------------------------
 
 
 def test_theta_max_is_the_widest_side():

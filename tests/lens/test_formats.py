@@ -71,16 +71,13 @@ PROGRAMS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        *((text, "") for text in OTHERS.values()),
-        *((text, f"its entries are {found}, but expected are, for example, {expected}")
-          for text, found, expected in NAMES),
-        *((text, f", as in files of {program}: let it write the cameras for {other}. The")
-          for text, program, other in PROGRAMS),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "said"), [
+    *((text, "") for text in OTHERS.values()),
+    *((text, f"its entries are {found}, but expected are, for example, {expected}")
+      for text, found, expected in NAMES),
+    *((text, f", as in files of {program}: let it write the cameras for {other}. The")
+      for text, program, other in PROGRAMS),
+])  # fmt: skip
 def test_a_text_of_no_format_is_told_by_its_entries(text, said):
     with pytest.raises(ValueError, match=UNKNOWN) as error:
         loads(text)
@@ -92,11 +89,10 @@ def test_a_text_of_no_format_is_told_by_its_entries(text, said):
     assert "appears twice" not in found
 
 
-@pytest.mark.parametrize(
-    ("given", "nearest"),
-    [("KanalaBrandt", "KannalaBrandt"), ("equidistant", "Equidistant"), ("Sperical", "Spherical"),
-     ("brown_conrady", "BrownConrady"), ("EQUISOLID", "Equisolid"), ("zzz", None), ("Kb", None)],
-)  # fmt: skip
+@pytest.mark.parametrize(("given", "nearest"), [
+    ("KanalaBrandt", "KannalaBrandt"), ("equidistant", "Equidistant"), ("Sperical", "Spherical"),
+    ("brown_conrady", "BrownConrady"), ("EQUISOLID", "Equisolid"), ("zzz", None), ("Kb", None),
+])  # fmt: skip
 def test_an_unknown_model_gets_the_nearest_name(given, nearest):
     meant = f"; did you mean {nearest}? The models" if nearest else ". The models"
     said = re.escape(f"unknown lens model '{given}'{meant}")
@@ -133,9 +129,6 @@ def test_entries_that_others_have_too_do_not_change_the_format():
         flat("k1", "k2", "k3", "k4", frames=12, model_type="fisheye"),
     ):
         assert loads(text).image_size.tolist() == [[960, 1280]]
-
-
-# -- files that are no calibrations ---------------------------------------------------------------
 
 
 def picture(form):
@@ -206,8 +199,7 @@ def test_a_file_of_another_kind_is_named(name, tmp_path, capsys):
     with pytest.raises(ValueError, match="but must be a calibration: text in YAML") as error:
         load(path)
     assert str(error.value).startswith(said)
-    with pytest.raises(SystemExit):
-        main(["lens", "info", str(path)])
+    pytest.raises(SystemExit, main, ["lens", "info", str(path)])
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"darswin: {said}") and "UTF-8" not in line
 
@@ -226,10 +218,9 @@ def test_calibrations_do_not_look_like_other_kinds():
 
 
 def test_a_file_that_is_missing(tmp_path, capsys):
-    with pytest.raises(
-        FileNotFoundError, match=r"^calibration .*none\.json: there is no such file$"
-    ):
-        load(tmp_path / "none.json")
+    pytest.raises(FileNotFoundError, load, tmp_path / "none.json").match(
+        r"^calibration .*none\.json: there is no such file$"
+    )
     with pytest.raises(SystemExit) as end:
         main(["lens", "info", "nofile"])
     assert end.value.code == 2

@@ -75,9 +75,6 @@ def test_models_that_contain_each_other():
     )
 
 
-# -- derivatives --------------------------------------------------------------------------------
-
-
 def in_parameters(lens, method):
     """`lens.method` as a function of its arguments and the parameters; the parameters."""
     tensors = {n: t.clone().requires_grad_() for n, t in lens._tensors().items()}
@@ -178,56 +175,50 @@ def test_where_nothing_lands_there_is_no_gradient_either(name):
     assert all(value.grad.isfinite().all() and value.grad.any() for value in values)
 
 
-# -- arguments ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
-        (lambda: Perspective(math.inf, 1.0), "focal must be"),
-        (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be at most 1.570795 rad"),
-        (lambda: Perspective(1.0, 0.0), "theta_max must be finite and above 0"),
-        (lambda: Perspective(1.0, math.nan), "theta_max must be"),
-        (lambda: Spherical(-0.1, 1.0, 1.0), "xi must be finite and at least 0, got -0.1"),
-        (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
-        (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57"),
-        (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be at most 2.09"),
-        (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be at most 2.09"),
-        (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
-        (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "got -0.2"),
-        (lambda: Spherical([[0.1]], 1.0, 1.0), "xi must be a number or (N,)"),
-        (lambda: EnhancedUnified(1.1, 1.0, 1.0), "alpha must be in [0, 1], got 1.1"),
-        (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
-        (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
-        (lambda: FieldOfView(math.pi, 1.0), "omega must be in (0, 3.14159)"),
-        (lambda: FieldOfView(0.0, 1.0), "omega must be in (0, 3.14159)"),
-        (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
-        (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999"),
-        (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
-        (lambda: Polynomial([]), "coefficients must be at least one per lens"),
-        (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
-        (lambda: Polynomial(1.0, 1.0), "coefficients must be (K) or (N, K)"),
-        (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
-        (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
-        (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), "tangential must be (2) or"),
-        (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), "prism must be (4) or"),
-        (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734"),
-        (lambda: Tabulated([0.0, 1.0], [0.0, 1.0, 2.0]), "angles and radii must have the same"),
-        (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
-        (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
-        (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be (2) or"),
-        (lambda: Perspective(1.0, 1.0, center=3.0), "center must be"),
-        (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
-        (lambda: Equidistant(1.0, affine=[1.0, 2.0]), "affine must be (2, 2) or (N, 2, 2)"),
-        (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
-        (lambda: Perspective.from_fov(3.2, 10.0), "fov must be at most 3.14159"),  # tan(θ_max) < 0
-        (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "radius must be finite and above 0"),
-        (lambda: Spherical(0.5, 10.0).with_theta_max(2.5), "theta_max must be at most 2.09"),
-        (lambda: to_dict(Spherical([0.1, 0.2], 300.0)), "one lens, got 2"),
-        (lambda: type("Spherical", (Lens,), {}), "a lens model Spherical exists already"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
+    (lambda: Perspective(math.inf, 1.0), "focal must be"),
+    (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be at most 1.570795 rad"),
+    (lambda: Perspective(1.0, 0.0), "theta_max must be finite and above 0"),
+    (lambda: Perspective(1.0, math.nan), "theta_max must be"),
+    (lambda: Spherical(-0.1, 1.0, 1.0), "xi must be finite and at least 0, got -0.1"),
+    (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
+    (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57"),
+    (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be at most 2.09"),
+    (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be at most 2.09"),
+    (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
+    (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "got -0.2"),
+    (lambda: Spherical([[0.1]], 1.0, 1.0), "xi must be a number or (N,)"),
+    (lambda: EnhancedUnified(1.1, 1.0, 1.0), "alpha must be in [0, 1], got 1.1"),
+    (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
+    (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
+    (lambda: FieldOfView(math.pi, 1.0), "omega must be in (0, 3.14159)"),
+    (lambda: FieldOfView(0.0, 1.0), "omega must be in (0, 3.14159)"),
+    (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
+    (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999"),
+    (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
+    (lambda: Polynomial([]), "coefficients must be at least one per lens"),
+    (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
+    (lambda: Polynomial(1.0, 1.0), "coefficients must be (K) or (N, K)"),
+    (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
+    (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
+    (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), "tangential must be (2) or"),
+    (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), "prism must be (4) or"),
+    (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734"),
+    (lambda: Tabulated([0.0, 1.0], [0.0, 1.0, 2.0]), "angles and radii must have the same"),
+    (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
+    (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
+    (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be (2) or"),
+    (lambda: Perspective(1.0, 1.0, center=3.0), "center must be"),
+    (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
+    (lambda: Equidistant(1.0, affine=[1.0, 2.0]), "affine must be (2, 2) or (N, 2, 2)"),
+    (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
+    (lambda: Perspective.from_fov(3.2, 10.0), "fov must be at most 3.14159"),  # tan(θ_max) < 0
+    (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "radius must be finite and above 0"),
+    (lambda: Spherical(0.5, 10.0).with_theta_max(2.5), "theta_max must be at most 2.09"),
+    (lambda: to_dict(Spherical([0.1, 0.2], 300.0)), "one lens, got 2"),
+    (lambda: type("Spherical", (Lens,), {}), "a lens model Spherical exists already"),
+])  # fmt: skip
 def test_a_value_out_of_range_is_named(make, said):
     with pytest.raises(ValueError) as error:
         make()
@@ -250,18 +241,15 @@ def test_rays_beyond_the_limit_land_nowhere(name):
     assert theta.grad.isfinite().all() and azimuth.grad.isfinite().all()
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: Perspective("wide", 1.0), "focal must be a number or a tensor, got 'wide'"),
-        (lambda: Spherical(object(), 1.0, 1.0), "xi must be a number"),
-        (lambda: Spherical(0.5, 1.0, thetamax=1.0), "thetamax"),
-        (lambda: Spherical.from_fov(2.0, 30.0), "'radius'"),
-        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0), "too many positional"),
-        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5), "multiple values"),
-        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0), "'focal'"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: Perspective("wide", 1.0), "focal must be a number or a tensor, got 'wide'"),
+    (lambda: Spherical(object(), 1.0, 1.0), "xi must be a number"),
+    (lambda: Spherical(0.5, 1.0, thetamax=1.0), "thetamax"),
+    (lambda: Spherical.from_fov(2.0, 30.0), "'radius'"),
+    (lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0), "too many positional"),
+    (lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5), "multiple values"),
+    (lambda: Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0), "'focal'"),
+])  # fmt: skip
 def test_an_argument_of_a_wrong_type_is_named(make, said):
     with pytest.raises(TypeError) as error:
         make()

@@ -223,11 +223,10 @@ def test_many_cameras_give_one_warning(tmp_path):
     assert not warned(lambda: load(path, camera=2)) and warned(lambda: load(path, camera=3))
 
 
-@pytest.mark.parametrize(
-    ("binning", "roi"),
-    [((0, 0), (101, 52, 640, 483)), ((2, 2), (0, 0, 300, 200)), ((3, 2), (900, 700, 380, 260)),
-     ((2, 2), (0, 0, 0, 0))],
-)  # fmt: skip
+@pytest.mark.parametrize(("binning", "roi"), [
+    ((0, 0), (101, 52, 640, 483)), ((2, 2), (0, 0, 300, 200)), ((3, 2), (900, 700, 380, 260)),
+    ((2, 2), (0, 0, 0, 0)),
+])  # fmt: skip
 def test_the_region_of_a_message_is_a_crop(binning, roi):
     assert not warned(lambda: loads(message(binning, roi)))
     quarter = json.dumps([[value / 4 for value in row] for row in K[:2]] + [[0, 0, 1]])

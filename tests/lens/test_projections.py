@@ -284,11 +284,10 @@ def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
         assert lens.unproject(torch.tensor([1.01, 2.0, 100.0], dtype=dtype) * end).isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("binning", "roi"),
-    [((0, 0), (101, 52, 640, 483)), ((1, 1), (0, 0, 1280, 960)), ((2, 2), (0, 0, 1280, 960)),
-     ((1, 4), (0, 0, 0, 0)), ((3, 2), (101, 52, 640, 483))],
-)  # fmt: skip
+@pytest.mark.parametrize(("binning", "roi"), [
+    ((0, 0), (101, 52, 640, 483)), ((1, 1), (0, 0, 1280, 960)), ((2, 2), (0, 0, 1280, 960)),
+    ((1, 4), (0, 0, 0, 0)), ((3, 2), (101, 52, 640, 483)),
+])  # fmt: skip
 def test_binned_regions_show_what_the_sensor_sees(binning, roi):
     whole = loads(message(), dtype=f64)
     lens = loads(message(binning, roi), dtype=f64).with_theta_max(None)

@@ -27,9 +27,6 @@ from darswin.lens.solve import direction_of
 OMNIDIR = Mei(double(1.72), 1040.0, double(-0.18, -0.5595), tangential=double(0.0014, -0.0006))
 
 
-# -- angles and radii ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_unproject_undoes_project_and_finds_nothing_beyond(name):
     generator = torch.Generator().manual_seed(5)
@@ -61,9 +58,6 @@ def test_unproject_undoes_project_and_finds_nothing_beyond(name):
             assert used.unproject(used.r_max[:, None]).isfinite().all()
 
 
-# -- rays and pixels ----------------------------------------------------------------------------
-
-
 def rays_of(lens, rings=16, spokes=24):
     """θ (N, rings, 1), almost up to θ_max, and φ (1, 1, spokes)."""
     near = 1 - double(1e-3, 1e-5, 1e-7)
@@ -72,11 +66,10 @@ def rays_of(lens, rings=16, spokes=24):
     return (lens.theta_max[:, None] * fractions)[..., None], azimuth[None, None]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [*ASIDE, "omnidir", "kitti360_02.yaml", "kitti360_03.yaml",
-     *((name, aside) for name in RANDOM[:4] for aside in (1, 10))],
-)  # fmt: skip
+@pytest.mark.parametrize("name", [
+    *ASIDE, "omnidir", "kitti360_02.yaml", "kitti360_03.yaml",
+    *((name, aside) for name in RANDOM[:4] for aside in (1, 10)),
+])  # fmt: skip
 def test_every_ray_is_found(name):
     if isinstance(name, tuple):
         lens = random_lens(name[0], 0, name[1], 3)
@@ -160,9 +153,6 @@ def test_rays_are_found_in_inference_mode():
     with torch.inference_mode():
         found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
     torch.testing.assert_close(found, expected)
-
-
-# -- points -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ASIDE)

@@ -195,8 +195,7 @@ def test_refusals(tmp_path):
         (two, "darswin", "one lens, got 2"),
         (load(FILES / "kalibr_ds.yaml"), "opencv", "OpenCV files cannot hold this DoubleS"),
     ):
-        with pytest.raises(ValueError, match=message):
-            save(wrong, tmp_path / "a", form)
+        pytest.raises(ValueError, save, wrong, tmp_path / "a", form).match(message)
     assert not list(tmp_path.iterdir())
 
 

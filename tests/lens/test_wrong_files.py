@@ -305,18 +305,12 @@ def test_errors_say_what_is_wrong(case):
     assert len(str(error.value)) < 1000
 
 
-# -- dicts and arguments --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("entries", "said"),
-    [
-        (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
-        (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
-        (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
-        (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
-    ],
-)
+@pytest.mark.parametrize(("entries", "said"), [
+    (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
+    (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
+    (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
+    (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
+])  # fmt: skip
 def test_dicts_are_refused_like_files(entries, said):
     with pytest.raises(ValueError, match=said):
         from_dict(dict(model="Equidistant") | entries, (100, 100))
@@ -334,41 +328,38 @@ def frames(count, **shared):
     return json.dumps({"frames": entries} | shared)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"a":' * 100_000, "nested"),
-        ("a: " + "[" * 100_000, "nested"),
-        ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most 256 KiB"),
-        ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
-        ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
-        (BOMB, "The formats are"),
-        (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
-         "image_height must be a whole number"),
-        (BOMB + "K: *j\n", "K must be 9 finite numbers"),
-        (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
-        ("a: &a [*a]\n", "it is not valid YAML"),
-        ("a: &a {b: *a}\nK: *a\n", "it is not valid YAML"),
-        ('<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><l><K>&a;</K></l>', "DOCTYPE"),
-        ('<!DOCTYPE l SYSTEM "file:///etc/passwd"><l/>', "DOCTYPE"),
-        ('{"K": ' + "9" * 5000 + "}", "it is not valid JSON"),
-        ('{"intrinsic": {"model": "radial_poly", "poly_order": 1, "k1": 1' + "0" * 400 + "}}",
-         "k1 must be a fin"),
-        ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
-        ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
-        ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
-        ("1 " * 1_000_000, "it is a table of 1 lines, but a table must have 5 lines of numbers"),
-        pytest.param("2 1 1\n" * 400_000, "it must have 5 lines", marks=pytest.mark.slow),
-        ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
-        ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
-        ("".join(f"{i} FOV\n" for i in range(9_000)), "camera '0', must have an id"),
-        pytest.param("1 FOV\n" * 100_000, "camera '1' appears twice", marks=pytest.mark.slow),
-        ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
-        (json.dumps({"model": "Polynomial", "coefficients": [1.0] * 20_000}), "at most 64 numbers"),
-        (frames(9_000), "several cameras"),
-        pytest.param(frames(120_000), "1 to 10000 cameras, got 120000", marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "message"), [
+    ('{"a":' * 100_000, "nested"),
+    ("a: " + "[" * 100_000, "nested"),
+    ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most 256 KiB"),
+    ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
+    ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
+    (BOMB, "The formats are"),
+    (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
+     "image_height must be a whole number"),
+    (BOMB + "K: *j\n", "K must be 9 finite numbers"),
+    (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
+    ("a: &a [*a]\n", "it is not valid YAML"),
+    ("a: &a {b: *a}\nK: *a\n", "it is not valid YAML"),
+    ('<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><l><K>&a;</K></l>', "DOCTYPE"),
+    ('<!DOCTYPE l SYSTEM "file:///etc/passwd"><l/>', "DOCTYPE"),
+    ('{"K": ' + "9" * 5000 + "}", "it is not valid JSON"),
+    ('{"intrinsic": {"model": "radial_poly", "poly_order": 1, "k1": 1' + "0" * 400 + "}}",
+     "k1 must be a fin"),
+    ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
+    ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
+    ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
+    ("1 " * 1_000_000, "it is a table of 1 lines, but a table must have 5 lines of numbers"),
+    pytest.param("2 1 1\n" * 400_000, "it must have 5 lines", marks=pytest.mark.slow),
+    ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
+    ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
+    ("".join(f"{i} FOV\n" for i in range(9_000)), "camera '0', must have an id"),
+    pytest.param("1 FOV\n" * 100_000, "camera '1' appears twice", marks=pytest.mark.slow),
+    ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
+    (json.dumps({"model": "Polynomial", "coefficients": [1.0] * 20_000}), "at most 64 numbers"),
+    (frames(9_000), "several cameras"),
+    pytest.param(frames(120_000), "1 to 10000 cameras, got 120000", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with few_calls(1_000_000), pytest.raises(ValueError, match=message) as error:
