@@ -122,3 +122,9 @@ def network(name, **options):
 def relative_error(got, expected):
     """The norm of the difference, divided by the norm of the expected values."""
     return ((got.float() - expected).norm() / expected.norm()).item()
+
+
+def refused(said, function, *arguments, error=ValueError, **options):
+    """Checks that a call ends with an error of these words."""
+    with pytest.raises(error, match=said):
+        function(*arguments, **options)

@@ -48,8 +48,7 @@ def test_an_edge_ends_at_corners():
     found = edges.curves(square)
     assert len(found) == 4 and all(95 < len(curve) < 125 for curve in found)
     for curve in found:
-        middle = curve - curve.mean(0)
-        assert np.linalg.svd(middle)[1][1] / math.sqrt(len(curve)) < 0.3
+        assert np.linalg.svd(curve - curve.mean(0))[1][1] / math.sqrt(len(curve)) < 0.3
 
 
 def test_the_longest_curve_is_first_and_an_even_picture_has_none():

@@ -36,8 +36,7 @@ def test_rays_of_exact_corners(model, fov):
 
 
 def test_a_pinhole_does_not_tell_its_center_so_it_starts_near_the_middle():
-    lens = true_lens("Perspective", 70)
-    start, _, _ = started(rig(lens, 10))
+    start, _, _ = started(rig(true_lens("Perspective", 70), 10))
     assert (start.center - torch.tensor([499.5, 479.5], dtype=f64)).norm() < 120
 
 
@@ -61,8 +60,7 @@ def test_signs_are_the_best_of_all():
     for _ in range(10):
         right = torch.randn(8, 3, generator=generator, dtype=f64)
         right[:, 0] += 2 * torch.randn(8, generator=generator, dtype=f64).sign()
-        solved = right.T
-        found = radial._signs(right, solved)
+        found = radial._signs(right, right.T)
         every = torch.tensor([*itertools.product((-1.0, 1.0), repeat=8)], dtype=f64)
         assert (found @ right).square().sum() >= 0.999 * (every @ right).square().sum(1).max()
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from helpers import refused
 from lens_examples import FILES, K, file_text, flat, loads, opencv
 from PIL import Image
 from videos import write_video
@@ -199,7 +200,8 @@ def test_a_file_of_another_kind_is_named(name, tmp_path, capsys):
     with pytest.raises(ValueError, match="but must be a calibration: text in YAML") as error:
         load(path)
     assert str(error.value).startswith(said)
-    pytest.raises(SystemExit, main, ["lens", "info", str(path)])
+    with pytest.raises(SystemExit):
+        main(["lens", "info", str(path)])
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"darswin: {said}") and "UTF-8" not in line
 
@@ -207,8 +209,7 @@ def test_a_file_of_another_kind_is_named(name, tmp_path, capsys):
 def test_a_recorded_video_is_named(tmp_path):
     for name, codec in (("a.mp4", "mp4v"), ("a.avi", "MJPG")):
         write_video(tmp_path / name, 3, codec=codec)
-        with pytest.raises(ValueError, match="it is a video, but must be a calibration"):
-            load(tmp_path / name)
+        refused("it is a video, but must be a calibration", load, tmp_path / name)
 
 
 def test_calibrations_do_not_look_like_other_kinds():
@@ -218,8 +219,11 @@ def test_calibrations_do_not_look_like_other_kinds():
 
 
 def test_a_file_that_is_missing(tmp_path, capsys):
-    pytest.raises(FileNotFoundError, load, tmp_path / "none.json").match(
-        r"^calibration .*none\.json: there is no such file$"
+    refused(
+        r"^calibration .*none\.json: there is no such file$",
+        load,
+        tmp_path / "none.json",
+        error=FileNotFoundError,
     )
     with pytest.raises(SystemExit) as end:
         main(["lens", "info", "nofile"])

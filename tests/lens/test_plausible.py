@@ -106,13 +106,11 @@ def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
 
 def genuine():
     """Lenses of examples and files, and crops and resizings of them."""
-    files = [*FILES.iterdir(), FILES.parents[2] / "examples" / "front.json"]
-    for path in files:
+    for path in [*FILES.iterdir(), FILES.parents[2] / "examples" / "front.json"]:
         if path.name != "README.md":
             file = Calibration.read(path, "fisheye" if "ambiguous" in path.name else None)
             for name in file.names:
-                lens = file.lens(name, image_size=(960, 1280), dtype=f64)
-                yield f"{path.name} {name}", lens
+                yield f"{path.name} {name}", file.lens(name, image_size=(960, 1280), dtype=f64)
     yield "front", FRONT
     for text in (flat("k1", "k2", "k3", "k4"), opencv(D=PLUMB_BOB), message()):
         yield text, loads(text, dtype=f64)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import changed
+from helpers import changed, refused
 from lens_examples import (
     CALIBRATIONS,
     DEGREES,
@@ -241,8 +241,7 @@ def test_ocamcalibs_polynomials_are_held_against_each_other():
         with pytest.raises(ValueError, match=r"must undo the direct one .* px for [\d.]+ px"):
             loads(ocam(DIRECT, INVERSE.replace(old, new)))
     for old, new in (("e+02", "e+021"), ("e-03", "e-031")):
-        with pytest.raises(ValueError, match=r"must undo|such that a₀"):
-            loads(ocam(DIRECT.replace(old, new), INVERSE))
+        refused(r"must undo|such that a₀", loads, ocam(DIRECT.replace(old, new), INVERSE))
 
 
 def test_scaramuzzas_axis_may_point_either_way():

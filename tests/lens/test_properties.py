@@ -82,8 +82,7 @@ def test_radii_and_angles_undo_each_other_and_nothing_else_lands(lens, data):
 def test_a_resized_or_cropped_lens_sees_the_same(lens, scale, data):
     share = data.draw(st.floats(0, 0.98))
     theta, azimuth = share * lens.theta_max[:, None], torch.tensor([[-2.5, 0.0, 1.0]], dtype=f64)
-    size = None if lens.image_size is not None else (480, 640)
-    pixels = lens.project_rays(theta, azimuth, size)
+    pixels = lens.project_rays(theta, azimuth, None if lens.image_size is not None else (480, 640))
     tolerance = 1e-9 * (1 + pixels.abs().max().item())
     if lens.center is None:
         return

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers import refused
 from hypothesis import strategies as st
 from lens_examples import ASIDE, FILES, assert_projects, double, example, f64, points_around
+from torch.testing import assert_close
 
 from darswin.cli.main import main
 from darswin.lens import MODELS, Spherical, as_curves, load, load_all, save
@@ -62,7 +64,7 @@ def test_a_written_file_reads_back_to_the_same_lens_or_is_refused(name, data, tm
             continue
         found = load(path, theta_max=0.3, dtype=f64)
         expected = lens.project_rays(theta, azimuth)
-        torch.testing.assert_close(found.project_rays(theta, azimuth), expected, rtol=0, atol=1e-9)
+        assert_close(found.project_rays(theta, azimuth), expected, rtol=0, atol=1e-9)
         assert found.image_size.tolist() == [[480, 640]]
 
 
@@ -82,8 +84,7 @@ def test_our_own_json_is_the_lens_to_the_bit(name, tmp_path):
         used = used.with_theta_max(share * used.theta_max)
         save(used, path)
         assert load(path, dtype=dtype).same_as(used)
-        found = load(path, dtype=other)
-        torch.testing.assert_close(found.theta_max, used.theta_max.to(other), rtol=0, atol=1e-4)
+        assert_close(load(path, dtype=other).theta_max, used.theta_max.to(other), rtol=0, atol=1e-4)
 
 
 # The formats that hold each camera; ours holds all.
@@ -142,9 +143,7 @@ def test_which_formats_hold_which_cameras_and_their_libraries_read_them(tmp_path
                 assert type(found) is type(lens), name
                 theta = torch.minimum(found.theta_max, lens.theta_max) * torch.linspace(0, 0.99, 20)
                 rays = theta, torch.linspace(-3, 3, 20, dtype=f64)
-                torch.testing.assert_close(
-                    found.project_rays(*rays), lens.project_rays(*rays), rtol=0, atol=1e-8
-                )
+                assert_close(found.project_rays(*rays), lens.project_rays(*rays), rtol=0, atol=1e-8)
                 if form == "kalibr":
                     kinds.add(check_kalibr(written, lens))
                 elif form == "opencv" and type(lens).__name__ not in ("Mei", "Spherical"):
@@ -195,7 +194,7 @@ def test_refusals(tmp_path):
         (two, "darswin", "one lens, got 2"),
         (load(FILES / "kalibr_ds.yaml"), "opencv", "OpenCV files cannot hold this DoubleS"),
     ):
-        pytest.raises(ValueError, save, wrong, tmp_path / "a", form).match(message)
+        refused(message, save, wrong, tmp_path / "a", form)
     assert not list(tmp_path.iterdir())
 
 

@@ -4,7 +4,7 @@ import json
 from itertools import pairwise
 
 import pytest
-from helpers import changed, few_calls
+from helpers import changed, few_calls, refused
 from lens_examples import (
     FISHEYE,
     FISHEYES,
@@ -312,8 +312,7 @@ def test_errors_say_what_is_wrong(case):
     (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
 ])  # fmt: skip
 def test_dicts_are_refused_like_files(entries, said):
-    with pytest.raises(ValueError, match=said):
-        from_dict(dict(model="Equidistant") | entries, (100, 100))
+    refused(said, from_dict, dict(model="Equidistant") | entries, (100, 100))
 
 
 # -- hostile and large files --------------------------------------------------------------------
