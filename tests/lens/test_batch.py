@@ -42,13 +42,15 @@ def test_indexing_and_joining():
     assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]
     with pytest.raises(IndexError):
         lens[3]
-    again = cat([lens[k] for k in range(3)])
-    assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
     assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
     assert len(lens[0].expand(5)) == 5
     refused("cannot expand", lens.expand, 4)
     refused("at least one", cat, [])
-    refused("center for all", cat, [lens[0], Spherical(0.1, 1.0, 1.0)])
+    plain = Spherical(0.1, 1.0, 1.0)
+    refused("center for all", cat, [lens[0], plain])
+    refused("image_size for all", cat, [plain.replace(image_size=torch.ones(1, 2)), plain])
+    both = cat([Spherical(0.5, 10.0, 1.0, affine=[[1.0, 0.0], [0.0, 2.0]]), plain])
+    assert isinstance(both, Spherical) and both.affine[1].tolist() == [[1.0, 0.0], [0.0, 1.0]]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -90,7 +92,7 @@ def test_a_column_of_coefficients_is_not_many_lenses():
     assert len(KannalaBrandt(300.0, [[0.01]])) == 1
 
 
-def test_the_same_numbers_are_the_same_lens():
+def test_the_same_numbers_are_the_same_lens_and_merge():
     lens = KannalaBrandt([8.0, 9.0], radial=[0.1, 0.0, 0.0, 0.0])
     assert lens.same_as(lens[:])
     for other in (
@@ -98,9 +100,6 @@ def test_the_same_numbers_are_the_same_lens():
         KannalaBrandt([8.0, 9.0]), Equidistant([8.0, 9.0], 1.0), None,
     ):  # fmt: skip
         assert not lens.same_as(other)
-
-
-def test_equal_lenses_merge():
     lens = KannalaBrandt([8.0, 9.0, 8.0], radial=[0.1, 0.0, 0.0, 0.0])
     assert lens.merged() is lens and lens[[0, 2]].merged().same_as(lens[0])
     assert len(lens[:0].merged()) == 0 and lens[1].merged().same_as(lens[1])

@@ -27,9 +27,6 @@ def test_paths(tmp_path):
     refused(r"calibration /.*large: it must be at most 16 MiB", load, tmp_path / "large")
     (tmp_path / "latin").write_bytes("name: caf\xe9".encode("latin-1"))
     refused(r"must be text in UTF-8: .* 0xe9", load, tmp_path / "latin")
-    marked = b"\xef\xbb\xbf" + FILES.joinpath("woodscape.json").read_bytes()
-    (tmp_path / "marked").write_bytes(marked)
-    assert load(tmp_path / "marked").r_max.item() > 600
 
 
 ENCODINGS = {
@@ -57,19 +54,15 @@ def test_editors_of_other_systems_may_have_saved_a_calibration(name, encoding, t
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_of_numpy(save, tmp_path):
     path = tmp_path / "calib.npz"
-    # Megabytes that do not belong to the lens.
-    points = np.random.default_rng(0).normal(size=(20, 5000, 3))
-    rvecs = np.array([np.zeros(3), np.zeros(2)], dtype=object)  # never unpickled
+    points = np.random.default_rng(0).normal(size=(20, 5000, 3))  # megabytes without a meaning
     save(path, mtx=np.array(K), dist=np.array([PLUMB_BOB]), DIM=np.array([1280, 960]), ret=0.31,
-         objpoints=points, rvecs=rvecs)  # fmt: skip
+         objpoints=points)  # fmt: skip
     described = to_dict(load(path, dtype=f64))
     expected = dict(model="BrownConrady", radial=[-0.22, 0.05, 0.003], tangential=[0.001, -0.002],
                     center=[320, 240], image_size=[960, 1280])  # fmt: skip
     assert described | expected == described
     save(path, cameraMatrix=np.array(K), distCoeffs=np.array(FISHEYE)[:, None])
     assert load(path, coefficients="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
-    save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
-    refused(r"D must be 0 or 4 or .*dtype', 'object'", load, path)
 
 
 CLOSE = 1.15  # the middles of both orders are so close that only an exact one tells them apart
@@ -117,12 +110,12 @@ def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
 def test_arrays_of_objects_are_named(tmp_path):
     """They are not unpickled. One that should hold numbers is an error, others are left out."""
     path, shape = tmp_path / "calib.npz", dict(width=1280, height=960, fisheye_model=1)
-    objects = np.array([[{"a": 1}]], dtype=object)
+    rows, entry = np.array([np.zeros(3), np.zeros(2)], dtype=object), np.array([[{}]], dtype=object)
     numbers = dict(K=np.reshape(K, (3, 3)), D=np.array(D[:4]))
     for name in numbers:
         np.savez(path, **numbers | {name: numbers[name].astype(object)}, **shape)
         refused(rf"{name} must be .*, got \['dtype', 'object'\]", load, path)
-    np.savez(path, **numbers, rvecs=objects, notes=objects, **shape)
+    np.savez(path, **numbers, rvecs=rows, notes=entry, **shape)
     assert load(path).radial.tolist() == [pytest.approx(D[:4])]
 
 

@@ -79,7 +79,9 @@ def test_a_whole_circle_sums_up_to_the_cap(theta_max):
 
 
 def test_float32_and_batches():
-    lens = Spherical([0.2, 0.9], 20.0, 1.2)
+    lens, distance = Spherical([0.2, 0.9], 20.0, 1.2), torch.rand(2, 30, 40)
+    with_channel = distance_to_z(distance[:, None], lens)
+    assert torch.equal(with_channel, distance_to_z(distance, lens)[:, None])
     found = solid_angles(lens, (40, 48))
     assert found.shape == (2, 40, 48) and found.dtype == torch.float32
     for k in range(2):
@@ -117,12 +119,6 @@ def test_rays_as_channels(name):
     torch.testing.assert_close(landed, torch.stack((x, y), -1).to(f64))
     rays.square().mul(torch.rand_like(rays)).sum().backward()
     assert center.grad.isfinite().all() and center.grad.all()
-
-
-def test_maps_with_a_channel_have_a_lens_each():
-    lens, distance = Spherical([0.2, 0.9], 20.0, 1.2), torch.rand(2, 30, 40)
-    with_channel = distance_to_z(distance[:, None], lens)
-    torch.testing.assert_close(with_channel, distance_to_z(distance, lens)[:, None])
 
 
 def test_what_is_not_known_stays_so():
@@ -178,10 +174,8 @@ def test_reproject_of_many():
 @pytest.mark.parametrize("size", [(64, 64), (40, 64), (64, 40)])
 def test_perspective_view(size):
     papers = 2 * math.atan(64 / 3)  # 174.6°, of the paper's images
-    for lens, theta_max in (
-        (Spherical.from_fov(0.5, papers, 32.0), papers / 2),
-        (Polynomial([20.0], math.radians(100)), math.radians(87.5)),
-    ):
+    wide = Polynomial([20.0], math.radians(100)), math.radians(87.5)
+    for lens, theta_max in ((Spherical.from_fov(0.5, papers, 32.0), papers / 2), wide):
         view = perspective_view(lens, size, math.radians(175))
         torch.testing.assert_close(view.theta_max, torch.tensor([theta_max]))
         torch.testing.assert_close(view.r_max, torch.tensor([min(size) / 2]), rtol=1e-4, atol=0)
