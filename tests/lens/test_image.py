@@ -21,7 +21,7 @@ def test_principal_point():
     refused("needs a lens that has an image_size", lens.resized, (3, 4))
 
 
-def test_resized_takes_any_number_and_nothing_that_is_no_image():
+def test_resized_and_cropped_take_any_number_and_nothing_that_is_no_image():
     lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
     whole = lens.resized(0.5)
     for half in (np.float32(0.5), np.float64(0.5), torch.tensor(0.5), np.array(0.5)):
@@ -37,6 +37,13 @@ def test_resized_takes_any_number_and_nothing_that_is_no_image():
         refused(r"image's \(H, W\) must be at least \(1, 1\), got", lens.resized, size)
     for size in ((483,), (1, 2, 3), "12", None, (2.5, 3), (math.nan, 3), (None, 3)):
         refused(r"size must be \(H, W\)|whole pixels", lens.resized, size, error=TypeError)
+    padded = lens.cropped(-8, -4, 499, 648)
+    assert padded.center.tolist() == [[323.5, 249.5]]
+    assert padded.image_size.tolist() == [[499, 648]]
+    for part in ((0, 0, -5, 10), (0, 0, 5, 0)):
+        refused(r"must be at least \(1, 1\)", lens.cropped, *part)
+    for part in ((0.5, 0, 5, 10), (0, 0, math.nan, 10), (None, 0, 5, 5)):
+        refused("an image has whole pixels, got", lens.cropped, *part, error=TypeError)
 
 
 def test_in_a_picture_of_the_same_view():
@@ -50,14 +57,3 @@ def test_in_a_picture_of_the_same_view():
         refused("calibration is for 1280×966", lens.in_picture, size)
     unknown = Equidistant(300.0, 1.5)
     assert unknown.in_picture((4, 9)) is unknown
-
-
-def test_cropped_takes_only_parts_with_pixels():
-    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
-    padded = lens.cropped(-8, -4, 499, 648)
-    assert padded.center.tolist() == [[323.5, 249.5]]
-    assert padded.image_size.tolist() == [[499, 648]]
-    for part in ((0, 0, -5, 10), (0, 0, 5, 0)):
-        refused(r"must be at least \(1, 1\)", lens.cropped, *part)
-    for part in ((0.5, 0, 5, 10), (0, 0, math.nan, 10), (None, 0, 5, 5)):
-        refused("an image has whole pixels, got", lens.cropped, *part, error=TypeError)

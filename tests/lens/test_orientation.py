@@ -30,9 +30,8 @@ def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
     went = where_pixels_went(orientation)
     height, width = went.shape[:2]
     corner, right, down = went[0, 0], went[0, 1] - went[0, 0], went[1, 0] - went[0, 0]
-    assert torch.equal(
-        went[height - 1, width - 1], corner + (width - 1) * right + (height - 1) * down
-    )
+    last = corner + (width - 1) * right + (height - 1) * down
+    assert torch.equal(went[height - 1, width - 1], last)
     return (points - corner) @ torch.linalg.inv(torch.stack((right, down)))
 
 
