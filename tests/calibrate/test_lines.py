@@ -59,10 +59,9 @@ def curves_of(
         if len(pixels) < 2:
             continue
         steps = np.r_[0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
-        count = int(min(steps[-1], rng.uniform(80, 300)))
-        if count < 60:
+        places = np.arange(int(min(steps[-1], rng.uniform(80, 300))))
+        if len(places) < 60:
             continue
-        places = np.arange(count)
         even = np.stack([np.interp(places, steps, pixels[:, j]) for j in (0, 1)], 1)
         curves.append(even + rng.normal(0, noise, even.shape) + center)
     return sorted(curves, key=len, reverse=True)
@@ -75,14 +74,11 @@ def board_of(lens, seed):
     rotation = turn[0] * np.sign(np.diag(turn[1]))
     for k in range(200):
         i, j = divmod(k % 100, 10)
-        start, step = ((i, j), (1, 0)) if k < 100 else ((i, j), (0, 1))
-        edge = np.linspace(start, np.add(start, step), 200)
-        points = (np.column_stack((edge, np.zeros(200))) - (5, 5, 0)) @ rotation.T + (0, 0, 14)
-        curves.append(points)
+        edge = np.linspace((i, j), (i + 1, j) if k < 100 else (i, j + 1), 200)
+        curves.append((np.pad(edge, ((0, 0), (0, 1))) - (5, 5, 0)) @ rotation.T + (0, 0, 14))
+    along = np.linspace(0, 0.6, 300)[:, None]
     curves += [
-        rng.uniform((-9, -6, 14), (9, 6, 18))
-        + np.linspace(0, 0.6, 300)[:, None] * rng.normal(size=3)
-        for _ in range(30)
+        rng.uniform((-9, -6, 14), (9, 6, 18)) + along * rng.normal(size=3) for _ in range(30)
     ]
     pixels = [lens.project_points(torch.from_numpy(c)[None])[0].numpy() for c in curves]
     seen = [p for p in pixels if (p > 0).all() and (p < np.array(SIZE[::-1]) - 1).all()]
@@ -102,14 +98,11 @@ def rim_of(lens, radius=240.0):
     return lens.with_theta_max(None).unproject(radius).item()
 
 
-@pytest.mark.parametrize(
-    ("name", "model"),
-    slow_but(
-        [(name, "Spherical") for name in LENSES]
-        + [(name, "KannalaBrandt") for name in LENSES if name.startswith("kannala")],
-        ("equisolid", "Spherical"), ("kannala 200", "KannalaBrandt"),
-    ),
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "model"), slow_but(
+    [*((name, "Spherical") for name in LENSES), ("kannala 150", "KannalaBrandt"),
+     ("kannala 200", "KannalaBrandt")],
+    ("equisolid", "Spherical"), ("kannala 200", "KannalaBrandt"),
+))  # fmt: skip
 def test_a_lens_is_found_from_lines_in_three_directions(name, model):
     found = from_curves([curves_of(LENSES[name], seed) for seed in (1, 2)], SIZE, model)
     assert type(found.lens).__name__ == model and found.lens.theta_max.dtype == torch.float64
@@ -246,6 +239,9 @@ def test_nothing_of_an_estimate_is_random():
     assert_same(*(from_curves(curves, SIZE) for _ in range(2)))
 
 
+NOISE = np.random.default_rng(0).integers(0, 256, (64, 64)).astype(np.uint8)
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     ({"pictures": []}, "one size .* got no pictures"),
     ({"pictures": [np.zeros((20, 30), np.uint8), np.zeros((30, 20), np.uint8)]},
@@ -254,17 +250,10 @@ def test_nothing_of_an_estimate_is_random():
     ({"fov": 7.0}, "`fov` must be above 0 and below 2π, got 7"),
     ({"fov": 2.0}, "no image circle is visible"),
     ({}, "only 0 curves may be straight lines"),
+    *(({"pictures": [NOISE[:height, :width]]}, "pictures must have at least 16 × 16 px")
+      for height, width in ((0, 0), (0, 20), (1, 1), (15, 40))),
+    *(({"pictures": [NOISE[:height, :width]]}, "curves may be straight lines")
+      for height, width in ((16, 16), (17, 40), (64, 64))),
 ])  # fmt: skip
 def test_wrong_arguments(arguments, message):
     refused(message, estimate, **{"pictures": [np.full((60, 80, 3), 90, np.uint8)]} | arguments)
-
-
-@pytest.mark.parametrize("size", [(0, 0), (0, 20), (1, 1), (15, 40)])
-def test_small_pictures_are_refused(size):
-    refused("pictures must have at least 16 × 16 px", estimate, [np.zeros(size, np.uint8)])
-
-
-@pytest.mark.parametrize("size", [(16, 16), (17, 40), (64, 64)])
-def test_noise_has_too_few_lines(size):
-    noise = np.random.default_rng(0).integers(0, 256, size).astype(np.uint8)
-    refused("curves may be straight lines", estimate, [noise], error=CalibrationError)
