@@ -125,6 +125,7 @@ def relative_error(got, expected):
 
 
 def refused(said, function, *arguments, error=ValueError, **options):
-    """Checks that a call ends with an error of these words."""
-    with pytest.raises(error, match=said):
+    """The message of the error with which a call ends; it must have these words."""
+    with pytest.raises(error, match=said) as caught:
         function(*arguments, **options)
+    return str(caught.value)

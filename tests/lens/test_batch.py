@@ -54,7 +54,7 @@ def test_indexing_and_joining():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_tensors_are_contiguous_however_a_lens_was_made(name):
+def test_a_lens_is_copied_whole_and_has_contiguous_tensors_however_it_was_made(name):
     lens = example(name, torch.Generator().manual_seed(1))
     lens = lens.replace(image_size=torch.full((1, 2), 64.0, dtype=f64).expand(4, 2))
     for other in (
@@ -64,6 +64,11 @@ def test_tensors_are_contiguous_however_a_lens_was_made(name):
         lens.to(torch.float32),
     ):  # fmt: skip
         assert all(tensor.is_contiguous() for tensor in other._tensors().values())
+    leaves, spec = pytree.tree_flatten(lens)
+    copies = pickle.loads(pickle.dumps(lens)), copy.deepcopy(lens)
+    assert all(torch.equal(other.r_max, lens.r_max) for other in copies)
+    assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
+    assert name in repr(lens)
 
 
 def test_strided_parameters_make_contiguous_lenses():
@@ -72,16 +77,6 @@ def test_strided_parameters_make_contiguous_lenses():
     assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
     lens.r_max.sum().backward()
     assert (table.grad[:, 1] != 0).all()  # gradients reach the given tensors
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_pickle_copy_and_pytree(name):
-    lens = example(name, torch.Generator().manual_seed(1))
-    for other in (pickle.loads(pickle.dumps(lens)), copy.deepcopy(lens)):
-        assert torch.equal(other.r_max, lens.r_max)
-    leaves, spec = pytree.tree_flatten(lens)
-    assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
-    assert type(lens).__name__ in repr(lens)
 
 
 def test_a_column_of_coefficients_is_not_many_lenses():

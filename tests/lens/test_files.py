@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from itertools import product
 
 import numpy as np
@@ -252,10 +253,6 @@ def test_a_field_of_view_fills_the_image():
 def test_files_of_new_variants_are_read():
     assert load(FILES / "ours_degrees.json").r_max.item() == pytest.approx(300)
     assert load(FILES / "numpy_shape.npz").image_size.tolist() == [[768, 1024]]
-    assert load(FILES / "opencv_size_matrix.yaml").image_size.tolist() == [[1200, 1920]]
-    assert list(load_all(FILES / "kalibr_equidistant_five.yaml")) == ["cam0"]
-    for name in ("kalibr_equidistant_five.yaml", "ros_equidistant_five.yaml"):
-        assert load(FILES / name).radial.shape == (1, 4)
 
 
 @pytest.mark.parametrize("name", ["woodscape.json", "synwoodscape.json"])
@@ -277,9 +274,7 @@ def test_up_of_a_vehicles_camera_is_that_of_its_rotation(name):
 def test_files_that_do_not_say_what_is_up(tmp_path, extrinsic, said):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(json.loads(file_text("woodscape.json")) | dict(extrinsic=extrinsic)))
-    with pytest.raises(ValueError, match=said) as error:
-        load_up(path)
-    assert str(path) in str(error.value)
+    refused(f"{re.escape(str(path))}.*{said}", load_up, path)
     refused("Kalibr files do not say which way is up", load_up, FILES / "kalibr_tumvi.yaml")
 
 

@@ -17,17 +17,13 @@ f64 = torch.float64
 SIZE = (5, 7)
 
 
-def where_pixels_went(orientation: int) -> torch.Tensor:
-    """(H, W, 2): the stored x and y of each pixel of the picture that Pillow makes upright."""
+def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
+    """Places (..., 2) in the upright picture of stored places, by Pillow's pixels."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.uint8)
     image = Image.fromarray(np.stack((x, y, y), -1))
     image.getexif()[ExifTags.Base.Orientation] = orientation
-    return torch.from_numpy(np.asarray(ImageOps.exif_transpose(image))[..., :2].astype(np.float64))
-
-
-def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
-    """Places (..., 2) in the upright picture of stored places, by Pillow's pixels."""
-    went = where_pixels_went(orientation)
+    # (H, W, 2): the stored x and y of each pixel of the picture that Pillow makes upright.
+    went = torch.from_numpy(np.asarray(ImageOps.exif_transpose(image))[..., :2].astype(float))
     height, width = went.shape[:2]
     corner, right, down = went[0, 0], went[0, 1] - went[0, 0], went[1, 0] - went[0, 0]
     last = corner + (width - 1) * right + (height - 1) * down
@@ -87,6 +83,8 @@ def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
         in_upright_picture(lens, (50, 50), 8)
     refused("orientation must be 1 to 8, got 9", upright, lens, 9)
     refused("needs an image_size", upright, Equidistant(20.0), 6)
+    refused("takes one lens, got 2", rotated, Equidistant([9.0, 8.0], image_size=SIZE), 0.1)
+    refused("image_size", rotated, Equidistant(9.0), 0.1)
 
 
 @given(lenses, st.floats(-3.2, 3.2), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))
@@ -96,8 +94,3 @@ def test_a_ray_lands_where_its_pixel_was_turned_to(lens, angle, theta, azimuth):
     torch.testing.assert_close(after.project_rays(theta, azimuth + angle), place)
     if lens.affine is None:  # then lengths stay the same
         torch.testing.assert_close(matrix[:, :2] @ matrix[:, :2].T, torch.eye(2, dtype=f64))
-
-
-def test_rotated_takes_one_lens_that_knows_its_middle():
-    refused("takes one lens, got 2", rotated, Equidistant([9.0, 8.0], image_size=SIZE), 0.1)
-    refused("image_size", rotated, Equidistant(9.0), 0.1)
