@@ -43,7 +43,6 @@ OTHERS = {
     "one number": "5\n",
     "pose": "1 0 0 0.5\n0 1 0 0\n0 0 1 2\n0 0 0 1\n",
     "trajectory": "1305031102.17 1.34 0.63 1.66 0.66 0.62 -0.29 -0.33\n" * 9,
-    "images.txt": "1 0.8 0.1 0.2 0.5 1.0 2.0 3.0 1 a.png\n2362.3 248.4 58396\n",
     "classes": "0 cat\n1 dog\n2 bird\n",
     "capitals": "0 CAT\n1 DOG\n",
 }  # fmt: skip

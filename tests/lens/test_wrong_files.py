@@ -159,7 +159,6 @@ TEXTS = (
     ("{}", 'The formats are darswin, WoodScape'), ("[1, 2]", "it must be a mapping"),
     ("word", "it must be a mapping"), ("", "it must not be empty"), (" \n\t\n", "be empty"),
     ("a: [1, 2", "not valid YAML: line 1: expected"), ("a: 1\n---\nb: 1", "not valid YAML"),
-    (ROS2 + ROS2, "it is not valid YAML: line"),
     ("a: \x00", "it is not valid YAML"), ('a: "\\UFFFFFFFF"', "it is not valid YAML"),
     # The choice of the camera.
     (TUMVI, "several cameras, choose one with `camera`: 'cam0', 'cam1'"),
