@@ -287,8 +287,8 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     width, height = high - low
     solid = 4 * np.arcsin(np.sin(width / 2) * np.sin(height / 2))
     solid[(width > np.pi) | (height > np.pi)] = np.nan
-    found = (azimuth, elevation, width, height, ray, solid)
-    return SphericalBoxes(*(_like(boxes, value) for value in found))
+    values = (azimuth, elevation, width, height, ray, solid)
+    return SphericalBoxes(*(_like(boxes, value) for value in values))
 
 
 def _looking(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

@@ -80,11 +80,10 @@ def rig(
     noise: float = 0.2,
     seed: int = 0,
     tilt: float = 45.0,
-    spin: float = 0.5,
     least: int = 12,
 ) -> Rig:
     """Boards at random places of the whole field of view, turned to the camera up to `tilt`,
-    degrees, and in the picture up to `spin`, rad. Each picture shows at least `least` corners."""
+    degrees. Each picture shows at least `least` corners."""
     points = board() if points is None else points
     generator = torch.Generator().manual_seed(seed)
     height, width = (round(side) for side in lens.image_size[0].tolist())
@@ -102,8 +101,8 @@ def rig(
         lean = math.radians(tilt) * u[2].sqrt() * torch.stack(
             (torch.cos(2 * math.pi * u[3]), torch.sin(2 * math.pi * u[3]), 0 * theta)
         )  # fmt: skip
-        about = 2 * spin * (u[4] - 0.5) * torch.stack((0 * theta, 0 * theta, 1 + 0 * theta))
-        rotation = facing @ turn(lean) @ turn(about)
+        spin = (u[4] - 0.5) * torch.stack((0 * theta, 0 * theta, 1 + 0 * theta))
+        rotation = facing @ turn(lean) @ turn(spin)
         radius = theta_max * (0.25 + 0.35 * u[5])  # half the board's size, as an angle
         distance = half / math.tan(min(radius, math.radians(40)))
         translation = distance * ray - rotation[:, :2] @ middle

@@ -15,12 +15,14 @@ from scipy.ndimage import map_coordinates
 
 import darswin
 from darswin import boxes
+from darswin.data.labels.labels import Thing, move_things
 from darswin.data.reframing import Warped
 from darswin.lens import (
     Equidistant,
     Equisolid,
     KannalaBrandt,
     Mei,
+    Perspective,
     Spherical,
     Stereographic,
 )
@@ -94,6 +96,46 @@ def test_the_map_is_called_once_for_all_boxes():
     calls = []
     boxes.carry(np.tile([0.0, 0, 9, 9], (100, 1)), lambda p: calls.append(p.shape) or p)
     assert calls == [(100, 72, 2)]
+
+
+def flat_and_wide():
+    flat = Perspective(focal=215.0, theta_max=1.2, image_size=(512, 512))
+    wide = Equidistant(193.0, 1.65, image_size=(240, 640))
+    narrow = Equidistant(200.0, 0.6, image_size=(256, 256))
+    return {
+        "border": (Warped(flat, wide), [[164.5, 90, 437.6, 96.5], [20, 20, 300, 300]]),
+        "θ_max": (Warped(flat, narrow), [[60, 60, 452, 452], [90, 200, 300, 240]]),
+        "source": (Warped(wide, flat), [[-300, -50, 200, 100], [450, 60, 640, 200]]),
+    }
+
+
+@pytest.mark.parametrize("way", ["border", "θ_max", "source"])
+def test_a_box_that_is_cut_is_that_of_what_is_left_of_its_ellipse(way):
+    """By every point of the ellipse, for bare boxes and for the polygons of their ellipses."""
+    to, table = flat_and_wide()[way]
+    radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None, None]
+    angle = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
+    circle = np.stack((np.cos(angle), np.sin(angle)), -1)
+    carried, visible = boxes.carry(table, to.to_new, to.size)
+    for box, found, share in zip(np.array(table, float), carried, visible, strict=True):
+        middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2
+        points = to.to_new(middle + radius * half * circle - 0.5) + 0.5
+        seen = ((points >= 0) & (points <= to.size[::-1])).all(-1)
+        assert share == pytest.approx(seen.mean(), abs=2e-3) and 0.01 < share < 0.99
+        assert boxes.iou(found[None], box_of(points[seen])[None])[0, 0] > 0.97
+        outline = middle + half * circle[::40]
+        things = [Thing(1, box), Thing(1, box, [outline])]
+        for thing in move_things(things, to):
+            assert boxes.iou(found[None], thing.box[None])[0, 0] > 0.99
+            assert thing.visible == pytest.approx(share, abs=2e-3)
+        mask = np.zeros(to.size, np.uint8)
+        outlines = [np.rint((one - 0.5) * 16).astype(np.int32) for one in thing.polygons]
+        cv2.fillPoly(mask, outlines, 1, shift=4)
+        y, x = np.mgrid[: to.size[0], : to.size[1]].astype(float)
+        old = (to.to_old(np.stack((x, y), -1)) + 0.5 - middle) / half
+        want = (old**2).sum(-1) <= 1  # not for NaN
+        if want.sum() > 2000:  # OpenCV fills the border too
+            assert (want & (mask > 0)).sum() / (want | (mask > 0)).sum() > 0.96
 
 
 def test_the_unseen_part_of_a_box():
@@ -347,6 +389,40 @@ def test_a_turned_camera_sees_the_same_box_elsewhere(azimuth, elevation):
     np.testing.assert_allclose(found.ray[0], turn.apply([0, 0, 1]), atol=1e-6)
 
 
+def fisheye_rays(points):
+    """θ = r / 100 px from the middle of a picture of 600 px, up to 240° across and no farther."""
+    plane = (points - 299.5) / 100
+    theta = np.linalg.norm(plane, axis=-1, keepdims=True)
+    rays = np.concatenate((plane * np.sinc(theta / np.pi), np.cos(theta)), -1)
+    return np.where(theta <= math.radians(120.1), rays, np.nan)
+
+
+def test_spherical_boxes_beyond_180_degrees_and_at_the_rim():
+    """What the camera that looks at the middle sees, by every point of the ellipse."""
+    wide, high = math.radians(240), math.radians(71)
+    sides = 100 * np.array([[wide, high], [high, wide], [wide, wide]])
+    found = boxes.spherical(np.concatenate((300 - sides / 2, 300 + sides / 2), 1), fisheye_rays)
+    np.testing.assert_allclose(found.width, sides[:, 0] / 100, rtol=1e-6)
+    np.testing.assert_allclose(found.height, sides[:, 1] / 100, rtol=1e-6)
+    assert np.isnan(found.solid_angle).all() and found.ray[:, 2] == pytest.approx(1)
+    rim = np.array([[380.0, 420, 520, 490]])
+    found = boxes.spherical(rim, fisheye_rays)
+    radius = np.sqrt(np.linspace(0, 1, 300))[:, None]
+    angle = np.linspace(0, 2 * np.pi, 3000)
+    x, y = 449.5 + radius * 70 * np.cos(angle), 454.5 + radius * 35 * np.sin(angle)
+    rays = fisheye_rays(np.stack((x, y), -1))
+    rays = rays[np.isfinite(rays[..., 0])]
+    assert len(rays) < 0.9 * x.size
+    ahead = found.ray[0]
+    right = np.cross([0, 1, 0], ahead) / np.linalg.norm(np.cross([0, 1, 0], ahead))
+    u, v, z = (rays @ np.stack((right, np.cross(ahead, right), ahead), 1)).T
+    scale = np.arctan2(np.hypot(u, v), z) / np.hypot(u, v)
+    for side, size in ((u * scale, found.width[0]), (v * scale, found.height[0])):
+        assert np.degrees([side.min() + size / 2, side.max() - size / 2]) == pytest.approx(
+            [0, 0], abs=0.05
+        )
+
+
 def test_spherical_boxes_of_what_is_not_seen():
     found = boxes.spherical([[0, 0, 9, 9]], lambda p: np.zeros((*p.shape[:-1], 3)))
     assert all(np.isnan(value).all() for value in found)
@@ -417,6 +493,15 @@ def test_long_runs_are_those_of_coco():
         ([3, -1, 10], "from 0 to 12, got \\["),
         ("04é", "must not contain"),
         ("0o", "ends within a number"),
+        ([2**63 - 1, 2**63 - 1, 14], "from 0 to 12, got"),
+        ([2**70, 1], "whole numbers, or a text"),
+        ([float("inf")], "whole numbers"),
+        ([1.5, 10.5], "whole numbers"),
+        (["a"], "whole numbers"),
+        ([[1], [2, 3]], "whole numbers"),
+        ([[12]], "from 0 to 12"),
+        ("o" * 40 + "0", "more than 60 bits"),
+        ("oooooo0", "at most"),
     ],
 )
 def test_wrong_run_lengths(counts, said):
@@ -500,7 +585,17 @@ def test_the_package_has_boxes():
     assert darswin.boxes is boxes
 
 
-@pytest.mark.parametrize("rle", [{"size": [2, 2]}, {"counts": [4]}, {"size": None, "counts": [4]}])
+@pytest.mark.parametrize(
+    "rle",
+    [
+        {"size": [2, 2]},
+        {"counts": [4]},
+        {"size": None, "counts": [4]},
+        {"size": [2**20, 2**20], "counts": [2**40]},
+        {"size": [-2, -2], "counts": [4]},
+        {"size": [float("nan"), 2], "counts": [4]},
+    ],
+)
 def test_an_encoding_has_a_size_and_counts(rle):
     with pytest.raises(ValueError, match=r"must have a size \[H, W\] and counts"):
         boxes.decode_rle(rle)

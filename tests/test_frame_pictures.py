@@ -103,7 +103,7 @@ def test_points_of_a_plan_are_those_of_the_lens(name, reads):
             plan.points(points, **of_tile),
             view.to_image(points, exact, SIZE, **of_tile),
         )
-        seen = ~np.isnan(found).any(-1)
+        seen = ~np.isnan(found + expected).any(-1)  # a plan ends within a pixel of the border
         inside = ((expected > 1) & (expected < [158, 118])).all(-1)
         assert seen[inside].mean() > 0.95 and seen.mean() > 0.05
         np.testing.assert_allclose(found[seen], expected[seen], atol=0.2)

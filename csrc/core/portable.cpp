@@ -3,13 +3,14 @@
 // These names are defined here, for this module alone: exports.map hides them. The last such name,
 // exp, is in kernels/math.h. Systems with other libraries, such as macOS, need none of this.
 //
-// Functions that a library itself calls are hidden here too: a program has no exports.map, and its
-// definitions would take the place of the library's.
+// Only modules have these definitions (CMakeLists.txt). A program has no exports.map: its own would
+// take the place of the library's, which calls them, and they would call themselves without end.
+// Those that a library calls are hidden for the same reason.
 #include <exception>
 #include <new>
 #include <sstream>
 
-#if defined(__GLIBCXX__) && defined(__GLIBC__)
+#if defined(DARSWIN_MODULE) && defined(__GLIBCXX__) && defined(__GLIBC__)
 
 // C++20's str() const&, str() && and default constructors. The error messages of torch use them.
 template class std::__cxx11::basic_stringbuf<char>;

@@ -120,11 +120,14 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         return "" if known else f"{columns}x{rows} inner corners"
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
-    parameters, found = cv2.aruco.DetectorParameters(), {}
-    for name in _names():
-        for parameters.markerBorderBits in (1, 2) if board.kind == "april" else (1,):  # Kalibr's: 2
+    parameters = cv2.aruco.DetectorParameters()
+    found: dict[str, list[int]] = {}
+    for name in (name for name in _names() if "H" not in name):  # 36H11 is another name of 36h11
+        # Kalibr draws the tags of its only set with a border of two bits.
+        for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
             detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
-            seen = [] if (numbers := detect(grey)[1]) is None else numbers.ravel().tolist()
+            numbers = detect(grey)[1]
+            seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
             found[name] = max(found.get(name, []), seen, key=len)
     most = max(map(len, found.values()))
     if most < 4:

@@ -148,7 +148,8 @@ def calibrate(
         _vector=best.state.vector,
         _joint=best.joint,
     )
-    stretch = best.stretch(views, counts)
+    picture, board = best.stretch(views, counts)
+    stretch = picture if square_pixels else 0.0, board  # else the lens has the ratio of its pixels
     calibration.doubts.extend(doubts(calibration, whole.seen, spot, stretch))
     return calibration
 

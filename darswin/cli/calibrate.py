@@ -254,6 +254,18 @@ def _within(brightest: "np.ndarray", lens: Lens) -> Lens:
     return lens.with_theta_max(theta) if math.isfinite(theta) else lens
 
 
+def _label(doubt: str, seen: _Seen) -> str:
+    """ "note" for what is usual and taken care of; "looks wrong" for what the user must act on."""
+    usual = [
+        "corner ",
+        "corners reach",
+        *["no board found"] * (len(seen.without) <= len(seen.names)),
+    ]
+    parts = "and is left out", "more corners are off"
+    is_usual = doubt.startswith(tuple(usual)) or any(part in doubt for part in parts)
+    return "note" if is_usual else "looks wrong"
+
+
 def _summary(found: "Found", seen: _Seen, lens: Lens) -> str:
     corners = int((found.weights > 0.1).sum())
     rows = [
@@ -262,7 +274,7 @@ def _summary(found: "Found", seen: _Seen, lens: Lens) -> str:
         ("noise", f"{found.sigma:.3f} px along x and y"),
         ("left out", f"{found.left_out:.3f} px in pictures that were left out"),
         ("supported", f"up to {math.degrees(found.supported):.1f}° from the axis"),
-        *(("looks wrong", doubt) for doubt in [*seen.doubts, *found.doubts]),
+        *((_label(doubt, seen), doubt) for doubt in [*seen.doubts, *found.doubts]),
     ]
     lines = [f"{name:<16}{text}" for name, text in rows]
     if found.models:

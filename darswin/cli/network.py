@@ -205,11 +205,10 @@ class NetworkAnswers(Answers):
         self._boxes.add(found)
         for tile, (inner, *others) in enumerate(found):
             inner = boxes.clip(inner, self.network.size)
-            carried, visible = boxes.carry(inner, partial(seen.sampler.plan.points, tile=tile))
+            carried, visible = boxes.carry(inner, partial(self._to_image, seen, size, tile), size)
             kept = (inner[:, :2] < inner[:, 2:]).all(1) & (visible > 0)
             parts.append([values[kept] for values in (carried, visible, *others)])
         carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
-        carried = boxes.clip(carried, size)
         if len(found) == 1:  # a network knows best which of its own boxes are one thing
             order = np.argsort(-scores, kind="stable")
         else:
@@ -240,6 +239,15 @@ class NetworkAnswers(Answers):
         ]
         name = file_of(entry, self._names)
         return {"overlay": write_overlay(self._out, name, picture), "detections": entries}
+
+    def _to_image(
+        self, seen: Seen, size: tuple[int, int], tile: int, points: np.ndarray
+    ) -> np.ndarray:
+        """Pixels (..., 2) of a tile of the view in the picture; NaN beyond the end of the lens."""
+        if isinstance(self.view, PlainView):
+            return points
+        of_tile = {"tile": tile} if self.view.count > 1 else {}
+        return self.view.to_image(points, seen.lens, size, **of_tile)
 
     def _name(self, label: int) -> str | int:
         """The name of a class, or its number if there are no names."""

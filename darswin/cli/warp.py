@@ -131,7 +131,7 @@ class _Left(NamedTuple):
     @property
     def fits_no_tile(self) -> bool:
         """Whether the tiles show enough of it only together."""
-        return sum(self.shares) >= LEAST_VISIBLE
+        return bool(sum(self.shares) >= LEAST_VISIBLE)
 
 
 class _Warped(NamedTuple):
@@ -347,8 +347,8 @@ def _write(
             os.path.normpath(name): [file for file, _ in one.pictures]
             for name, one in zip(data.files, found, strict=True)
         }
-        entries, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
-        write_yolo(folder, pictures, data.categories, entries)
+        said, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
+        write_yolo(folder, pictures, data.categories, said)
         for split in missing:
             print(f"left out of data.yaml, because it is not in {data.folder}: {split}")
     else:
@@ -364,7 +364,7 @@ def _write(
     left = [
         {
             "file": name, "id": lost.thing.more.get("id"), "category": names[lost.thing.category],
-            "visible": round(max(lost.shares), 3), "fits_no_tile": lost.fits_no_tile,
+            "visible": round(float(max(lost.shares)), 3), "fits_no_tile": lost.fits_no_tile,
         }
         for name, one in zip(data.files, found, strict=True)
         for lost in one.left
@@ -386,13 +386,13 @@ def _write(
             f"{large} things are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of them, "
             f"only several together; {listed}"
         )
-    said = []
+    report: list[str] = []
     for texts, what in (
         (bad, f"{len(bad)} of {len(data)} pictures were left out"),
         (wrong, f"{len(wrong)} pictures and annotations of the labels were left out"),
     ):
         if texts:
             more = [f"and {len(texts) - _NAMED} more"] * (len(texts) > _NAMED)
-            said += [f"{what}:", *texts[:_NAMED], *more]
-    if said:
-        raise BrokenImageError("\n".join(said))
+            report += [f"{what}:", *texts[:_NAMED], *more]
+    if report:
+        raise BrokenImageError("\n".join(report))

@@ -21,8 +21,9 @@ class LensAdapter(Model[Any]):
 
     The network runs on a view of the image, and its results come back to the pixels of the images:
 
-    - maps, results with 4 dimensions (B, K, H', W') for any size, are resampled to (B, K, H, W),
-      and pixels that no ray reaches get 0;
+    - maps, results with 4 dimensions (B, K, H', W') for any size, are resampled to (B, K, H, W).
+      Maps of integers, such as ids, take the nearest value. Pixels that the view does not show get
+      0; `adapter.prepare(lens, size).shown` is their mask;
     - detections, a dict of "boxes", "scores" and "labels" or a list of such dicts for each picture,
       as torchvision returns them, become a list with a dict for each image: boxes in pixels of the
       images, and "rays" (K, 3), the directions of their middles, and "visible" (K,), the share of

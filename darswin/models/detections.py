@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin import boxes as of_boxes
+from darswin.lens.pixels import OUTSIDE
 from darswin.utils.tables import read_table
 from darswin.views import PolarGrid, Prepared, View
 
@@ -55,9 +56,10 @@ def detections_to_images(
             are. Values of another length are left out. The coordinates are torchvision's.
 
     Returns:
-        For each image, the same dicts. The boxes are cut at the borders of the image, and those of
-        several tiles are merged, the best first. "visible" (K,) is the share of each box that
-        the image shows, and boxes that it does not show are left out. "rays" (K, 3) are the
+        For each image, the same dicts. The boxes are those of what the image shows of the ellipses
+        inside them, and those of several tiles are merged, the best first. "visible" (K,) is the
+        share of the area of each ellipse that the image shows, and boxes that it does not show are
+        left out. "rays" (K, 3) are the
         directions of the middles in the camera's frame, unless the view ignores the lens. Masks
         are resampled to the image. Keypoints that the image does not show are NaN.
 
@@ -68,18 +70,20 @@ def detections_to_images(
     images = [found[k : k + view.count] for k in range(0, len(found), view.count)]
     if isinstance(prepared.points, PolarGrid):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
-    points = _tables(_inside(prepared), view.count)
+    points = _tables(_landing(prepared), view.count)
     rays = _tables(None if prepared.rays is None else prepared.rays.movedim(1, -1), view.count)
     results = []
     for k, tiles in enumerate(images):
+        own_points, own_rays = (of[min(k, len(of) - 1)] for of in (points, rays))
         carried = [
-            _carried(part, *(of[min(k, len(of) - 1)][tile] for of in (points, rays)))
+            _carried(part, prepared.size, own_points[tile], own_rays[tile])
             for tile, part in enumerate(tiles)
         ]
         joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
         if "masks" in joined:
             joined["masks"] = _masks_in_image(joined["masks"], view, prepared, k)
-        joined["boxes"] = of_boxes.clip(joined["boxes"], prepared.size)
+        if prepared.points is None:  # the picture is the image
+            joined["boxes"] = of_boxes.clip(joined["boxes"], prepared.size)
         seen = joined["visible"] > 0
         joined = {name: value[seen] for name, value in joined.items()}
         if view.count > 1:
@@ -94,22 +98,21 @@ def _masks_in_image(masks: Tensor, view: View, prepared: Prepared, image: int) -
     if view.count > 1:
         raise ValueError("masks of tiles cannot come back: choose a view of one picture")
     if isinstance(prepared.back, Tensor):
-        number = min(image, len(prepared.back) - 1)
-        prepared = prepared._replace(back=prepared.back[number : number + 1])
+        number, around = min(image, len(prepared.back) - 1), prepared.around
+        if around is not None and len(around) > 1:
+            around = around[number : number + 1]
+        prepared = prepared._replace(back=prepared.back[number : number + 1], around=around)
     height, width = prepared.size
     in_image = view.back(masks.reshape(1, -1, *masks.shape[-2:]), prepared)
     return in_image.view(*masks.shape[:-2], height, width)
 
 
-def _inside(prepared: Prepared) -> Tensor | None:
-    """The points at which a view reads the images; NaN outside of them, as in `frames.Plan`."""
+def _landing(prepared: Prepared) -> Tensor | None:
+    """The points at which a view reads the images, also beside them; NaN where no ray lands."""
     if prepared.points is None:
         return None
     assert isinstance(prepared.points, Tensor)
-    height, width = prepared.size
-    points = prepared.points
-    inside = (points > -1) & (points < points.new_tensor([width, height]))
-    return torch.where(inside.all(-1, keepdim=True), points, torch.nan)
+    return torch.where(prepared.points == OUTSIDE, torch.nan, prepared.points)
 
 
 def _tables(values: Tensor | None, count: int) -> Any:
@@ -121,10 +124,13 @@ def _tables(values: Tensor | None, count: int) -> Any:
 
 
 def _carried(
-    found: Mapping[str, Tensor], points: np.ndarray | None, rays: np.ndarray | None
+    found: Mapping[str, Tensor],
+    size: tuple[int, int],
+    points: np.ndarray | None,
+    rays: np.ndarray | None,
 ) -> dict[str, Tensor]:
-    """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image along
-    rays (H', W', 3)."""
+    """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image (H, W)
+    along rays (H', W', 3)."""
     boxes, scores = found["boxes"], found["scores"]
     count = len(boxes)
     if boxes.shape != (count, 4) or scores.shape != (count,) or found["labels"].shape != (count,):
@@ -149,10 +155,13 @@ def _carried(
     def to_image(pixels: np.ndarray) -> np.ndarray:
         return read_table(points, (pixels + 0.5) * reads - 0.5)
 
-    carried, visible = of_boxes.carry(boxes, to_image)
+    carried, visible = of_boxes.carry(boxes, to_image, size)
     moved = dict(boxes=carried, visible=visible)
     if "keypoints" in kept:
         places = of_boxes.carry_points(kept["keypoints"][..., :2], to_image)
+        sides = places.new_tensor(size[::-1])
+        outside = ((places < 0) | (places > sides)).any(-1, keepdim=True)
+        places = torch.where(outside, torch.nan, places)
         moved["keypoints"] = torch.cat((places, kept["keypoints"][..., 2:]), -1)
     middle = boxes.detach().double().cpu().unflatten(1, (2, 2)).mean(1).numpy() - 0.5
     inside = np.clip(middle, 0, [width - 1, height - 1])

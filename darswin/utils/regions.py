@@ -13,7 +13,7 @@ import numpy as np
 PointMap = Callable[[np.ndarray], np.ndarray]
 
 NO_AREA = 1e-6  # px², of rounding
-_HALVINGS = 30
+_STEPS, _HALVINGS = 24, 26
 _RAYS = 360
 _TURN = np.linspace(-np.pi, np.pi, _RAYS, endpoint=False)
 _GRID = np.stack(np.meshgrid(*[(np.arange(16) + 0.5) / 16] * 2), -1).reshape(-1, 2)
@@ -71,9 +71,9 @@ def shown_parts(
 
     def carry(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         new = points_map(points)
-        shown = np.isfinite(new).all(-1)
+        shown = np.asarray(np.isfinite(new).all(axis=-1))
         if size is not None:
-            shown &= ((new >= 0) & (new <= size[::-1])).all(-1)
+            shown &= ((new >= 0) & (new <= size[::-1])).all(axis=-1)
         return new, shown
 
     if not len(outlines):
@@ -125,7 +125,9 @@ def _cut_parts(
     grids = low[:, None] + _GRID * sides[:, None]
     on_grid = carry(grids.reshape(-1, 2))[1].reshape(len(cut), -1)
     rays = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
-    middles, inner, outer = [], [], []
+    middles: list[np.ndarray | None] = []
+    inner: list[np.ndarray] = []
+    outer: list[np.ndarray] = []
     for one, grid, seen, side in zip(cut, grids, on_grid, sides, strict=True):
         candidates = np.concatenate((grid[seen], one.line[one.seen]))
         if not len(candidates):
@@ -158,8 +160,14 @@ def _last_shown(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The last points that are shown on the ways from points that are to points that are not, and
     where the map leads."""
-    (new, _), (ends, is_shown) = carry(inner), carry(outer)
-    inner, new = (np.where(is_shown[:, None], a, b) for a, b in ((outer, inner), (ends, new)))
+    # What is shown may begin again farther out: the first end counts.
+    steps = np.linspace(0, 1, _STEPS + 1)[:, None, None]
+    way = inner + steps * (outer - inner)
+    new, shown = carry(way.reshape(-1, 2))
+    new, shown = new.reshape(*way.shape[:2], -1), shown.reshape(way.shape[:2])
+    last = np.where(shown.all(0), _STEPS, np.argmin(shown, 0) - 1)
+    each = np.arange(len(inner))
+    inner, outer, new = way[last, each], way[np.minimum(last + 1, _STEPS), each], new[last, each]
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
         there, shown = carry(middle)

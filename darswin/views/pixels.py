@@ -76,10 +76,16 @@ class PixelView(View):
             of_tile: `tile=k`, the number of the tile, if the view has tiles.
 
         Returns:
-            Points as given, which may be outside of the image; NaN where no ray lands.
+            Points as given; NaN where the image shows nothing: no ray lands, or it is outside.
         """
-        return _exactly(points, lens, size, lambda pixels, exact: exact.project_points(
-            self.to_rays(pixels, exact, size, **of_tile), size))  # fmt: skip
+
+        def move(pixels: Tensor, exact: Lens) -> Tensor:
+            places = exact.project_points(self.to_rays(pixels, exact, size, **of_tile), size)
+            sides = tensor_there(size[::-1], places)
+            beyond = (places + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
+            return torch.where(beyond.any(-1, keepdim=True), torch.nan, places)
+
+        return _exactly(points, lens, size, move)
 
     def to_view(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
         """Pixels (..., 2) of images of (H, W) → pixels (..., 2) of the view: the inverse of

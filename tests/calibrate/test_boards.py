@@ -285,6 +285,7 @@ def test_small_pictures_show_nothing(size):
     assert image_circle([picture]) is None and image_circle([0 * picture]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("board", "said"), [
     (Board.april_grid(6, 4, 0.04, 0.3), "the gap is a ratio"),
     (Board.april_grid(4, 6, 0.04, 0.012), "columns and rows are swapped"),
@@ -300,9 +301,10 @@ def test_tags_that_do_not_fit_the_board_are_told(board, said):
     assert said in shown_instead(picture, board)
 
 
+@pytest.mark.slow
 def test_the_smallest_set_of_markers_is_named():
     known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
-    drawn = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, known).generateImage((640, 480))
+    drawn = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, known).generateImage((400, 300))
     for dictionary, named in (("5X5_250", "4X4_50"), ("4X4_250", "4X4_250")):
         board = Board.charuco(6, 8, 0.03, 0.022, dictionary=dictionary)
         assert f"markers 0 to 23 of {named}" in shown_instead(drawn, board)

@@ -70,6 +70,7 @@ def test_a_perspective_view_is_that_of_opencv(folder, capsys):
     camera = lenses.load(out / "lens.json", dtype=torch.float64)
     assert math.isclose(camera.focal.item(), 64 / math.tan(math.radians(50)))
     f, (x, y) = camera.focal.item(), camera.center_in()[0].tolist()
+    assert math.isclose(camera.theta_max.item(), math.atan(math.hypot(64, 48) / f), rel_tol=1e-6)
     new = np.array([[f, 0, x], [0, f, y], [0, 0, 1]])
     maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), new, SIZE[::-1], cv2.CV_32FC1)
     expected = cv2.remap(picture(), *maps, cv2.INTER_LINEAR)
@@ -349,6 +350,7 @@ def test_one_plan_serves_all_pictures_of_one_size(mixed, monkeypatch):
             ["in/a.png", "--out=in"],
             "--out must be a folder without the originals, but has in/a.png",
         ),
+        (["in", "--out=/proc/x"], "--out must be a folder that can be written, got /proc/x"),
         (["in", "--out=."], "--out must be a folder without the originals, but has in"),
         (["in", "--out=in"], "--out must be a folder without the originals, but has in"),
         (["more", "--out=more/own"], "no pictures or videos in more, apart from those of --out"),

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -252,7 +253,8 @@ def test_things_that_leave_are_reported(flat, tmp_path, capsys):
     left = json.loads((tmp_path / "out" / "left.json").read_text())
     kept = json.loads(file.read_text())["annotations"]
     assert left and sorted([one["id"] for one in left + kept]) == list(range(1, 10))
-    assert set(left[0]) == {"file", "id", "category"}
+    assert set(left[0]) == {"file", "id", "category", "visible", "fits_no_tile"}
+    assert max(one["visible"] for one in left) < 0.2 and not left[0]["fits_no_tile"]
     said = capsys.readouterr().out
     assert f"{len(left)} things have left the picture, because less than 20% of them" in said
 
@@ -407,9 +409,6 @@ def test_wrong_options(flat, tmp_path, capsys, to, options, said):
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        (lambda c: c["annotations"][0].update(category_id=9), "has the category 9, but the"),
-        (lambda c: c["annotations"][0].update(image_id=9), "is of the picture 9, which"),
-        (lambda c: c["images"][0].update(file_name="no.png"), "1 of 3 pictures of .* are not in"),
         (lambda c: c.pop("categories"), "must have the lists"),
         (lambda c: c["categories"][0].pop("name"), "a category must have a name, got {'id': 1}"),
         (lambda c: c["categories"][0].update(keypoints=[1]), "is not in COCO's form: 'int' obj"),
@@ -423,11 +422,99 @@ def test_wrong_sets(flat, tmp_path, capsys, edit, said):
     assert not (tmp_path / "out").exists()
 
 
-def test_pictures_that_cannot_be_read_are_named_at_the_end(flat, tmp_path, capsys):
-    source = edited(flat, tmp_path, lambda c: c["annotations"][0].update(bbox=[0, 0, None, 1]))
+def test_what_cannot_be_read_is_named_at_the_end(flat, tmp_path, capsys):
+    """A bad annotation does not take its picture away, and a missing picture no other."""
+
+    def edit(content):
+        content["annotations"][0].update(bbox=[0, 0, None, 1])
+        content["annotations"][1].update(category_id=9)
+        content["images"][1].update(height=9)
+        content["images"][2].update(file_name="no.png")
+
+    source = edited(flat, tmp_path, edit)
     text = refused(source, tmp_path / "out", WIDE, "--lens", FLAT, capsys=capsys)
-    assert "1 of 3 pictures were left out" in text and "the annotation 1 has the box" in text
-    assert len(read_coco(tmp_path / "out" / "annotations.json")) == 2
+    assert "1 of 2 pictures were left out" in text and "3 pictures and annotations of" in text
+    for said in ("1.png has 400 × 9 px", "no picture no.png", "annotation 1 has the box",
+                 "annotation 2 has the category 9"):  # fmt: skip
+        assert said in text
+    data = read_coco(tmp_path / "out" / "annotations.json")
+    assert [thing.more["id"] for thing in data.labels(0).things] == [3] and len(data) == 1
+
+
+@pytest.mark.parametrize(("shares", "said"), [((0.1, 0.15), "too large for"), ((0.1, 0), "left")])
+def test_what_no_tile_shows_is_named_as_what_it_is(
+    flat, tmp_path, capsys, monkeypatch, shares, said
+):
+    def lost(things, move):
+        given = (*shares, 0.0, 0.0)[len(calls) % 4]
+        calls.append(move)
+        return [replace(thing, visible=given) for thing in things]
+
+    calls = []
+    monkeypatch.setattr(module, "move_things", lost)
+    warp(flat, tmp_path / "out", "tiles:4", "--size", "32,32", "--lens", FLAT)
+    assert f"9 things {'are' if 'large' in said else 'have'} {said} the" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("layout", ["images/train", "train/images", "lists", "only names"])
+def test_the_splits_of_yolo_stay_apart(tmp_path, layout, capsys):
+    root, out = tmp_path / "in", tmp_path / "out"
+    files = {"train": "images/train/a.png", "val": "images/val/b.png"}
+    content = {"flip_idx": [0, 2, 1], "nc": 1, "names": {0: "cone"}}
+    splits = {"train": "images/train", "val": ["images/val"], "test": "images/test"}
+    if layout == "train/images":
+        files = {"train": "train/images/a.png", "val": "valid/images/b.png"}
+        splits = {"train": "../train/images", "val": "../valid/images"}
+    if layout == "lists":
+        splits = {"path": "../in", "train": "train.txt", "val": "sub/val.txt"}
+    if layout == "only names":
+        splits = {}
+    for file in files.values():
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(root / file), np.zeros((60, 80, 3), np.uint8))
+        text = (root / file.replace("images", "labels")).with_suffix(".txt")
+        text.parent.mkdir(parents=True, exist_ok=True)
+        text.write_text("0 0.5 0.5 0.3 0.3\n")
+    (root / "sub").mkdir()
+    (root / "train.txt").write_text(f"./{files['train']}\n")
+    (root / "sub/val.txt").write_text(f"{root / files['val']}\nnowhere.png\n")
+    (root / "data.yaml").write_text(yaml.safe_dump(splits | content))
+    warp(root / "data.yaml", out, "tiles:4", "--lens", FLAT, "--size", "32,32")
+    found = yaml.safe_load((out / "data.yaml").read_text())
+    assert {name: found[name] for name in content} == content
+    assert ("left out of data.yaml" in capsys.readouterr().out) == ("test" in splits)
+    want = {name: value for name, value in splits.items() if name not in ("path", "test")}
+    if layout == "train/images":
+        want = {name: value.removeprefix("../") for name, value in want.items()}
+    assert {name: found[name] for name in ("train", "val", "test") if name in found} == want
+    assert len(list(out.rglob("a_?.png"))) == len(list(out.rglob("b_?.txt"))) == 4
+    if layout == "lists":
+        names = [f"./images/val/b_{k}.png" for k in range(4)]
+        assert (out / "sub/val.txt").read_text().split() == names
+
+
+def test_two_pictures_never_become_one(tmp_path, capsys):
+    source = write_set(tmp_path / "in", 2, ("box",))
+    folder = source.parent / "images"
+    (folder / "0.png").rename(folder / "0.gif.png")
+    Image.fromarray(np.zeros((*SIZE, 3), np.uint8)).save(folder / "0.gif")
+    content = json.loads(source.read_text())
+    for entry, name in zip(content["images"], ("0.gif.png", "0.gif"), strict=True):
+        entry["file_name"] = name
+    source.write_text(json.dumps(content))
+    text = refused(source, tmp_path / "out", WIDE, "--lens", FLAT, capsys=capsys)
+    assert "0.gif.png and 0.gif would both become 0.gif.png: rename one" in text
+
+
+def test_a_folder_with_a_coco_file(flat, tmp_path, capsys):
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "images").symlink_to(flat.parent / "images")
+    (tmp_path / "annotations/instances.json").write_text(flat.read_text())
+    file = warp(tmp_path, flat.parent.parent / f"of_{tmp_path.name}", WIDE, "--lens", FLAT)
+    assert len(read_coco(file)) == 3
+    (tmp_path / "annotations/other.json").write_text(flat.read_text())
+    text = refused(tmp_path, tmp_path.parent / "no", WIDE, "--lens", FLAT, capsys=capsys)
+    assert "2 files of labels: give one of them" in text and "other.json" in text
 
 
 def test_a_view_that_sees_nothing_of_the_lens(flat, tmp_path, capsys, monkeypatch):

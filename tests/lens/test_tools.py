@@ -1,12 +1,17 @@
 """Files of other tools, repeated messages, and what a format cannot hold."""
 
 import json
+import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers import CALIBRATIONS
 
-from darswin.lens import load
+from darswin.cli.main import main
+from darswin.lens import Fisheye624, load, save
 
 MATRIX = [[500, 0, 320.5], [0, 501, 240.5], [0, 0, 1]]
 # The start of the files of programs, in their own words; and the name and the advice in the error.
@@ -70,3 +75,50 @@ def test_equal_messages_are_one_camera(end, tmp_path):
     path.write_text("---\n".join(messages) + end)
     with pytest.raises(ValueError, match=r"documents 1 and 3, .* differ in width: keep one"):
         load(path)
+
+
+TILTED = Fisheye624(
+    300.0, radial=[0.02, -0.01], tangential=[0.0012, -0.0008], prism=[0.001, 0.0, -0.0006, 0.0],
+    center=[320.2, 239.1], image_size=(480, 640), theta_max=1.2,
+    affine=[[1.0, 0.002], [0.001, 1.003]],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("out", "model", "lost"),
+    [
+        ("camera.yaml", "KannalaBrandt", "tangential terms and prism terms and skew"),
+        pytest.param("camera.yaml", "Mei", "prism terms and skew", marks=pytest.mark.slow),
+        ("kalibr.yaml", "KannalaBrandt", "tangential terms and prism terms and skew"),
+        ("camera.json", "Equidistant", "tangential terms and prism terms"),
+        ("camera.json", "KannalaBrandt", None),
+    ],
+)
+def test_convert_leaves_out_what_the_format_cannot_hold(out, model, lost, tmp_path, capsys):
+    given, path = tmp_path / "given.json", tmp_path / out
+    save(TILTED, given)
+    main(["lens", "convert", str(given), str(path), "--model", model])
+    printed = capsys.readouterr().out
+    assert ("it leaves out" in printed) == (lost is not None)
+    assert lost is None or f", whose {lost} it leaves out" in printed
+    said = float(re.search(r"at most (\S+) px", printed)[1])
+    found = load(path).with_theta_max(None)
+    theta = torch.linspace(0.05, 1.2, 40)[:, None].expand(40, 60)[None]
+    azimuth = torch.linspace(0, 2 * math.pi, 60)[None, None].expand(1, 40, 60)
+    apart = found.project_rays(theta, azimuth) - TILTED.project_rays(theta, azimuth)
+    assert apart.norm(dim=-1).max().item() == pytest.approx(said, rel=0.06)
+
+
+def test_a_calibration_replaces_calibrations_alone(tmp_path, capsys):
+    given, other, new = (str(tmp_path / name) for name in ("a.json", "b.json", "c.json"))
+    save(TILTED, given)
+    Path(other).write_bytes(b"\x89PNG and more")
+    with pytest.raises(SystemExit) as end:
+        main(["lens", "convert", given, other])
+    assert (
+        end.value.code == 2 and "b.json would replace a file that is no" in capsys.readouterr().err
+    )
+    assert Path(other).read_bytes() == b"\x89PNG and more"
+    for _ in range(2):
+        main(["lens", "convert", given, new])
+    assert load(new).same_as(load(given))

@@ -25,7 +25,7 @@ K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 FRAME = {"fl_x": 800.0, "fl_y": 800.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 COLMAP = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
-TUMVI, ROS2 = file_text("kalibr_tumvi.yaml"), file_text("ros2_echo.yaml")
+TUMVI = file_text("kalibr_tumvi.yaml")
 
 # For each file: its format, and the replaced text, its replacement, and the words of the error.
 CHANGED = {

@@ -96,13 +96,16 @@ def test_points_go_through_every_lens_and_come_back(name, model):
     points = np.random.default_rng(0).uniform(5, 195, (300, 2))
     if name == "none":
         points = lens.center_in(size)[0].numpy() + (points / 100 - 1) * 0.7 * lens.r_max.item()
+    shares = []
     for tile in range(view.count):
         of_tile = dict(tile=tile) if view.count > 1 else {}
         places = view.to_image(points, lens, size, **of_tile)
         seen = ~np.isnan(places).any(-1)
-        assert seen.mean() > (0.05 if name in ("panorama", "tiles") else 0.3)
+        assert (abs(2 * places[seen] + 1 - size[::-1]) <= np.array(size[::-1]) + 0.01).all()
+        shares.append(seen.mean())
         back = view.to_view(places[seen], lens, size, **of_tile)
         np.testing.assert_allclose(back, points[seen], rtol=0, atol=2e-4)
+    assert max(shares) > {"tiles": 0.02, "panorama": 0.05}.get(name, 0.3)
 
 
 @every_ray_view

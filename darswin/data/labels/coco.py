@@ -210,7 +210,7 @@ def _labels(
 def _side(given: Any) -> Any:
     """A side in px, which some tools write as text; what is none stays as it is."""
     try:
-        return int(given) if float(given) == int(given) else given
+        return int(number) if (number := float(given)).is_integer() else given
     except (TypeError, ValueError, OverflowError):
         return given
 
@@ -232,7 +232,7 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
     polygons, rle, mask = [], None, np.zeros(size, bool)
     if isinstance(segments, Mapping):
         rle = dict(segments)
-        if (sides := list(map(_side, np.ravel(rle.get("size"))))) == list(size):
+        if (sides := list(map(_side, np.ravel(np.asarray(rle.get("size"), object))))) == list(size):
             rle["size"] = sides  # which may have been texts
         elif len(sides) == 2:
             raise ValueError(f"has a mask of {rle['size']} px in a picture of {list(size)}")

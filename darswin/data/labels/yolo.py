@@ -192,7 +192,7 @@ def _write_list(
     root: Path, name: str, folder: Path, new_names: Mapping[str, Sequence[str]]
 ) -> None:
     """The list of pictures of a split, with the new names."""
-    lines = []
+    lines: list[str] = []
     for line in map(str.strip, read_text(root / name).splitlines()):
         places = [root / name / ".." / line, root / line]
         files = [os.path.relpath(place, root) for place in places]

@@ -1,11 +1,12 @@
 """Writes calibration files."""
 
+import itertools
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
@@ -66,41 +67,33 @@ def is_held(lens: Lens, path: str | os.PathLike, format: str | None) -> bool:
 
 
 def closest(model: str, lens: Lens, path: str | os.PathLike, format: str | None) -> Fit:
-    """`fit` of a model to one lens, without what the format of a path cannot hold: tangential and
-    prism terms, further radial ones, and skew. If it cannot hold the model, as `fit`."""
+    """`fit` of a model to one lens, without what the format of a path cannot hold: skew, tangential
+    and prism terms, and radial ones beyond two. If it holds no such lens, as `fit`."""
     whole = fit(model, lens)
-    if not is_held(_bare(whole.lens), path, format):
-        return whole
-    for found in _simpler(whole.lens, model, lens):
-        if is_held(found, path, format):
-            return Fit(found, largest_distance(found, lens))
+    for terms, left_out in itertools.product((None, 2), ((), ("prism",), ("prism", "tangential"))):
+        for kept in ([[1, 1], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [0, 1]]):
+            found = _without(whole.lens, terms, left_out, kept)
+            if found is None or not is_held(found, path, format):
+                continue
+            if terms is None and not left_out:
+                return Fit(found, largest_distance(found, lens))
+            given = lens.replace(**dict.fromkeys({*left_out} & {*lens.optional}))
+            found = _without(fit(model, given, terms=terms).lens, terms, left_out, kept)
+            if found is not None and is_held(found, path, format):
+                return Fit(found, largest_distance(found, lens))
     return whole
 
 
-def _simpler(found: Lens, model: str, lens: Lens) -> Iterator[Lens]:
-    """A fitted lens, and then lenses of its model with fewer and fewer terms."""
-    yield from _less_skewed(found)
-    if not isinstance(found, DistortedLens) or found.radial is None:
-        return
-    for terms in (None, 2):
-        for left_out in (("prism",), ("prism", "tangential")):
-            given = lens.replace(**dict.fromkeys({*left_out} & {*lens.optional}))
-            fitted = fit(model, given, terms=terms).lens
-            yield from _less_skewed(fitted.replace(**dict.fromkeys(left_out)))
-
-
-def _bare(lens: Lens) -> Lens:
-    """A lens with the fewest terms of its model, which a format holds if it holds any."""
-    lens = lens.replace(affine=None)
-    if not isinstance(lens, DistortedLens) or lens.radial is None:
-        return lens
-    return lens.replace(tangential=None, prism=None, radial=lens.radial[:, :2])
-
-
-def _less_skewed(lens: Lens) -> Iterator[Lens]:
-    """A lens, and the same with rows along x, and with columns along y too."""
-    yield lens
+def _without(
+    lens: Lens, terms: int | None, left_out: tuple[str, ...], kept: list[list[int]]
+) -> Lens | None:
+    """A lens with so many radial terms, without others, and with the `kept` places of its affine;
+    None if its model has no terms to leave out."""
+    changed: dict[str, Tensor | None] = {}
     if lens.affine is not None:
-        rows, columns = torch.tensor([[1, 1], [0, 1.0]]), torch.eye(2)
-        for kept in (rows, columns):
-            yield lens.replace(affine=lens.affine * kept.to(lens.affine))
+        changed["affine"] = lens.affine * torch.tensor(kept).to(lens.affine)
+    if terms is not None or left_out:
+        if not isinstance(lens, DistortedLens) or lens.radial is None:
+            return None
+        changed |= {"radial": lens.radial[:, :terms], **dict.fromkeys(left_out)}
+    return lens.replace(**changed)

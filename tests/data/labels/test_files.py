@@ -1,6 +1,7 @@
 """COCO, YOLO and WoodScape: files read, written and read again, and wrong files."""
 
 import json
+import math
 import re
 
 import cv2
@@ -10,9 +11,11 @@ import yaml
 from scenes import write_woodscape
 
 from darswin.boxes import encode_rle
+from darswin.data import Moved
 from darswin.data.labels import (
     Labels,
     Thing,
+    moved,
     open_labels,
     read_coco,
     read_woodscape_boxes,
@@ -20,6 +23,7 @@ from darswin.data.labels import (
     write_coco,
     write_yolo,
 )
+from darswin.lens import Equidistant
 
 SIZE = (60, 80)
 MASK = np.zeros(SIZE, np.uint8)
@@ -154,8 +158,6 @@ def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (changed(0, category_id=3), "the annotation 5 has the category 3, but the categories are"),
-        (changed(1, image_id=77), "the annotation 6 is of the picture 77, which the file does not"),
         (changed(0, bbox=[1, 2, float("nan"), 3]), "annotation 5 has the box .*finite numbers"),
         (changed(0, bbox=[1, 2, 3]), "annotation 5 has the box"),
         (changed(0, bbox=None), "annotation 5 has the box"),
@@ -164,17 +166,75 @@ def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
         (changed(1, keypoints=[1, 2]), "annotation 6 has the keypoints"),
         (changed(2, segmentation={"size": [3, 4], "counts": [12]}), "a mask of \\[3, 4\\] px"),
         ({"annotations": [{"id": 1, "image_id": 9, "category_id": 1}]}, "1 has no bbox"),
-        ({"annotations": [{"id": 1}]}, "lacks 'category_id'"),
         ({"annotations": {}}, 'must have the lists "images"'),
         ({"categories": [{"name": "dog"}]}, "lacks 'id'"),
         ({"images": [*IMAGES, IMAGES[0]]}, "lists a picture twice"),
         ({"images": [IMAGES[0] | {"width": 81}, *IMAGES[1:]]}, "81 × 60 px, but it has 80 × 60"),
-        ({"images": [{"file_name": "d.png", "id": 9}, *IMAGES[1:]]}, r"1 of 3 pictures .*d\.png"),
+        (
+            {"images": [IMAGES[0] | {"width": 60, "height": 80}, *IMAGES[1:]]},
+            "80 × 60 when its EXIF orientation turns it upright",
+        ),
+        ({"images": [{"file_name": "d.png", "id": 9}]}, r"1 of 1 pictures .*d\.png"),
+        (changed(0, bbox=[10, 20, 0, 15]), "annotation 5 has a bbox of 0 × 15 px, and neither"),
+        (changed(0, bbox=[10, 20, 1e9, 15]), "annotation 5 .* reaches farther than 8000 px"),
+        (changed(1, segmentation=[[0, 0, 1e9, 0, 1e9, 1e9]]), "annotation 6 .* reaches farther"),
+        (changed(0, iscrowd="yes"), "annotation 5 has iscrowd 'yes', which must be 0 or 1"),
+        (changed(0, attributes={"rotation": "a"}), "annotation 5 has the rotation 'a'"),
     ],
 )
 def test_wrong_coco_files(tmp_path, changes, said):
     with pytest.raises((ValueError, FileNotFoundError), match=said):
         read_coco(write(tmp_path, **changes)).labels(0)
+
+
+def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):
+    """The others are read."""
+    wrong = [
+        (ANNOTATIONS[0] | {"category_id": 3}, "5 has the category 3, but the categories are"),
+        (ANNOTATIONS[0] | {"image_id": 77}, "5 is of the picture 77, which the file does not list"),
+        ({"id": 8}, "8 lacks 'category_id'"),
+        ([1], r"an annotation must be a JSON object with ids, got \[1\]"),
+        (ANNOTATIONS[0] | {"image_id": {}}, "must be a JSON object"),
+    ]
+    images = [*IMAGES, {"id": 5, "file_name": "d.png"}]
+    file = write(tmp_path, images=images, annotations=[*ANNOTATIONS, *(one for one, _ in wrong)])
+    (tmp_path / "images" / "a.png").unlink()
+    data = read_coco(file)
+    assert list(data.files) == ["sub/b.png", "c.png"] and len(data.labels(0).things) == 1
+    said = [*(text for _, text in wrong), "no picture a.png in", "no picture d.png in"]
+    for text, words in zip(data.wrong, said, strict=True):
+        assert str(file) in text and re.search(words, text)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(segmentation=[[]]), dict(segmentation=[[10, 20, 30, 15]]),
+        dict(segmentation=[[10, 20, 40, 35]]), dict(segmentation=[[10, 20, 20, 20, 40, 20]]),
+        dict(segmentation=encode_rle(0 * MASK)), dict(bbox=["10", "20", "30", "15"]),
+        dict(iscrowd="0"), dict(iscrowd=None), dict(attributes={"rotation": 0.0}),
+    ],
+)  # fmt: skip
+def test_what_is_no_outline_is_the_box(tmp_path, changes):
+    sides = [IMAGES[0] | {"width": "80", "height": "60.0"}, *IMAGES[1:]]
+    thing = read_coco(write(tmp_path, images=sides, **changed(0, **changes))).labels(0).things[0]
+    np.testing.assert_array_equal(thing.box, [10, 20, 40, 35])
+    assert not len(thing.polygons) and thing.rle is None and not thing.crowd and not thing.turn
+
+
+def test_a_turned_box_of_cvat_is_that_of_its_turned_ellipse(tmp_path):
+    file = write(tmp_path, **changed(0, attributes={"rotation": 30.0, "occluded": True}))
+    data = read_coco(file)
+    write_coco(tmp_path / "again.json", [(IMAGES[0], data.labels(0))], CATEGORIES)
+    again = json.loads((tmp_path / "again.json").read_text())["annotations"][0]
+    assert again["attributes"] == {"rotation": pytest.approx(30), "occluded": True}
+    lens = Equidistant(20.0, 1.6, image_size=SIZE)
+    (thing, *_), *_ = moved(data.labels(0), Moved(lens, (0, 0, *SIZE), SIZE))
+    sin, cos = math.sin(math.radians(30)), math.cos(math.radians(30))
+    half = np.hypot([15 * cos, 15 * sin], [7.5 * sin, 7.5 * cos])
+    middle = np.array([25, 27.5])
+    np.testing.assert_allclose(thing.box, np.r_[middle - half, middle + half], atol=0.01)
+    assert not thing.turn and thing.more["attributes"] == {"occluded": True}
 
 
 def test_boxes_that_are_missing_are_those_of_polygons_and_masks(tmp_path):
@@ -276,12 +336,18 @@ def test_parts_of_an_outline_are_joined_for_yolo(tmp_path, parts):
 @pytest.mark.parametrize(
     "line",
     ["2 0.5 0.5 1 1", "-1 0.5 0.5 1 1", "0.5 .5 .5 1 1", "0 0.5 0.5 1", "0 0.1 0.1 0.5 0.1 0.5",
-     "0 nan 0.5 1 1", "0 a b c d", "0"],
+     "0 nan 0.5 1 1", "0 a b c d", "0", "0 .5 .5 0 .1", "0 .1 .1 .1 .1 .1 .1", "0 9e9 0 1 1"],
 )  # fmt: skip
 def test_wrong_lines_of_yolo(tmp_path, line):
+    """They are named, and the others are read."""
     data = read_yolo(yolo(tmp_path, f"0 0.5 0.5 1 1\n{line}\n"))
-    with pytest.raises(ValueError, match=r"a\.txt, line 2: must be a class below 2 and 4 numbers"):
+    words = "be shares" if "9e9" in line else "have an area" if line[2:4] in (".5", ".1") else (
+        "be a class below 2 and 4 numbers"
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=rf"a\.txt, line 2: must {words}"):
         data.labels(0)
+    labels, wrong = data.read(data.raw[0], SIZE)
+    assert len(labels.things) == len(wrong) == 1
 
 
 def test_folders_that_are_not_yolo(tmp_path):
@@ -323,6 +389,6 @@ def test_wrong_boxes_of_woodscape(tmp_path, text, said):
     folder = tmp_path / "box_2d_annotations" / "box_2d_annotations"
     (folder / "00001_RV.txt").write_text(text)
     with pytest.raises(ValueError, match=said):
-        read_woodscape_boxes(tmp_path)
+        read_woodscape_boxes(tmp_path).labels(1)
     (folder / "00001_RV.txt").write_text("")
     assert not read_woodscape_boxes(tmp_path).labels(1).things
