@@ -17,15 +17,10 @@ f64 = torch.float64
 def published(a, b):
     """Shirley and Chiu's map of one place, with the four regions of their paper."""
     if a > -b:
-        if a > b:
-            r, phi = a, math.pi / 4 * (b / a)
-        else:
-            r, phi = b, math.pi / 4 * (2 - a / b)
-    elif a < b:
-        r, phi = -a, math.pi / 4 * (4 + b / a)
-    else:
-        r, phi = -b, math.pi / 4 * (6 - a / b) if b else 0.0
-    return r, phi
+        return (a, math.pi / 4 * (b / a)) if a > b else (b, math.pi / 4 * (2 - a / b))
+    if a < b:
+        return -a, math.pi / 4 * (4 + b / a)
+    return -b, math.pi / 4 * (6 - a / b) if b else 0.0
 
 
 def grid(count):
@@ -105,9 +100,9 @@ def test_there_and_back(name, spacing):
     assert (places[~beyond].abs() <= 1).all()
     # The directions at the places of the image's pixels are those of the image's rays.
     radius, direction = square_to_disc(places)
-    got = torch.atan2(direction[..., 1], direction[..., 0])[~beyond & (radius > 1e-3)]
-    want = azimuth.expand_as(radius)[~beyond & (radius > 1e-3)]
-    assert torch.allclose(torch.cos(got - want), torch.ones((), dtype=f64))
+    apart = torch.atan2(direction[..., 1], direction[..., 0]) - azimuth.expand_as(radius)
+    same = torch.cos(apart[~beyond & (radius > 1e-3)])
+    assert torch.allclose(same, torch.ones((), dtype=f64))
     if spacing == "theta":
         share = (theta / lens.theta_max[:, None, None])[~beyond]
         assert_close(radius[~beyond], share.clamp(max=1), atol=1e-7, rtol=1e-7)

@@ -59,9 +59,8 @@ def tokens(data: bytes) -> list[re.Match]:
 def of_camera(name: str, place: str) -> tuple[bytes, list[re.Match]]:
     """A file, and its camera's distinctive numbers: not 0, and with at least two digits."""
     data = FILES.joinpath(name).read_bytes()
-    found = []
-    for block in re.finditer(place.encode(), data, re.DOTALL):
-        found += NUMBER.finditer(data, *block.span())
+    blocks = re.finditer(place.encode(), data, re.DOTALL)
+    found = [m for block in blocks for m in NUMBER.finditer(data, *block.span())]
     told = [m for m in found if float(m[0]) and len(re.sub(rb"e.*|\D", b"", m[0]).strip(b"0")) > 1]
     return data, told
 
