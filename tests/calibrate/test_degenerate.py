@@ -66,9 +66,7 @@ ERRORS = {
 @pytest.mark.parametrize("case", ERRORS)
 def test_errors(case):
     corners, points, options, words = ERRORS[case]
-    with pytest.raises(ValueError, match=words) as caught:
-        calibrate(corners, points, SIZE, **options)
-    assert str(caught.value).count("\n") == 0
+    assert "\n" not in refused(words, calibrate, corners, points, SIZE, **options)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

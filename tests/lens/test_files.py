@@ -320,7 +320,7 @@ def test_several_cameras():
     assert loads(json.dumps(same)).focal.item() == pytest.approx(851.2)
     # A stereo pair of OpenCV.
     pair = dict(M1=K, D1=[0.1, 0, 0, 0, 0], M2=K, D2=[0.2, 0, 0, 0, 0], width=640, height=480)
-    lenses = [loads(json.dumps(pair), camera=k, dtype=f64) for k in (0, 1)]
+    lenses = [loads(json.dumps(pair), camera=k, dtype=f64) for k in ("1", "2")]
     assert [lens.radial[0, 0].item() for lens in lenses] == [0.1, 0.2]
     assert load(FILES / "basalt.json", camera="cam4").image_size.tolist() == [[480, 640]]
     # If the names are numbers, a number is a name.
