@@ -127,3 +127,10 @@ def relative_error(got, expected):
 def in_this_process(work, jobs, *_):
     """In place of `run_all` of the studies, which runs jobs in processes of their own."""
     return [work(*job) for job in jobs]
+
+
+def refused(said, function, *arguments, error=ValueError, **options):
+    """The message of the error with which a call ends; it must have these words."""
+    with pytest.raises(error, match=said) as caught:
+        function(*arguments, **options)
+    return str(caught.value)

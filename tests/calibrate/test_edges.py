@@ -36,20 +36,16 @@ def test_points_of_an_edge_are_within_a_tenth_of_a_pixel(radius, channels):
 
 def test_an_edge_ends_at_corners():
     turn = math.radians(17)
-    square = drawn(
-        lambda x, y: (
-            np.maximum(
-                abs((x - 160) * math.cos(turn) + (y - 120) * math.sin(turn)),
-                abs((y - 120) * math.cos(turn) - (x - 160) * math.sin(turn)),
-            )
-            < 60
-        )
-    )
-    found = edges.curves(square)
+
+    def square(x, y):
+        across = (x - 160) * math.cos(turn) + (y - 120) * math.sin(turn)
+        down = (y - 120) * math.cos(turn) - (x - 160) * math.sin(turn)
+        return np.maximum(abs(across), abs(down)) < 60
+
+    found = edges.curves(drawn(square))
     assert len(found) == 4 and all(95 < len(curve) < 125 for curve in found)
     for curve in found:
-        middle = curve - curve.mean(0)
-        assert np.linalg.svd(middle)[1][1] / math.sqrt(len(curve)) < 0.3
+        assert np.linalg.svd(curve - curve.mean(0))[1][1] / math.sqrt(len(curve)) < 0.3
 
 
 def test_the_longest_curve_is_first_and_an_even_picture_has_none():

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import few_calls
+from helpers import few_calls, refused
 from lens_examples import FILES, FISHEYE, PLUMB_BOB, f64, file_text, loads
 
 from darswin.lens import load, load_all, to_dict
@@ -21,20 +21,12 @@ D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 
 
 def test_paths(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load(tmp_path / "none.json")
     for path in (tmp_path, "/dev/zero"):
-        with pytest.raises(ValueError, match="it must be a file"):
-            load(path)
+        refused("it must be a file", load, path)
     (tmp_path / "large").write_bytes(b" " * ((16 << 20) + 1))
-    with pytest.raises(ValueError, match=r"calibration /.*large: it must be at most 16 MiB"):
-        load(tmp_path / "large")
+    refused(r"calibration /.*large: it must be at most 16 MiB", load, tmp_path / "large")
     (tmp_path / "latin").write_bytes("name: caf\xe9".encode("latin-1"))
-    with pytest.raises(ValueError, match=r"must be text in UTF-8: .* 0xe9"):
-        load(tmp_path / "latin")
-    marked = b"\xef\xbb\xbf" + FILES.joinpath("woodscape.json").read_bytes()
-    (tmp_path / "marked").write_bytes(marked)
-    assert load(tmp_path / "marked").r_max.item() > 600
+    refused(r"must be text in UTF-8: .* 0xe9", load, tmp_path / "latin")
 
 
 ENCODINGS = {
@@ -46,11 +38,10 @@ ENCODINGS = {
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(
-    "name",
-    ["opencv_fisheye.yaml", "kalibr_ds.yaml", "kitti360_02.yaml", "woodscape.json", "ours.json",
-     "opencv_omnidir.xml", "ocamcalib.txt", "colmap.txt"],
-)  # fmt: skip
+@pytest.mark.parametrize("name", [
+    "opencv_fisheye.yaml", "kalibr_ds.yaml", "kitti360_02.yaml", "woodscape.json", "ours.json",
+    "opencv_omnidir.xml", "ocamcalib.txt", "colmap.txt",
+])  # fmt: skip
 def test_editors_of_other_systems_may_have_saved_a_calibration(name, encoding, tmp_path):
     path = tmp_path / name
     text = file_text(name)
@@ -60,26 +51,18 @@ def test_editors_of_other_systems_may_have_saved_a_calibration(name, encoding, t
     assert to_dict(load(path, dtype=f64)) == to_dict(load(FILES / name, dtype=f64))
 
 
-# -- arrays of NumPy ---
-
-
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_of_numpy(save, tmp_path):
     path = tmp_path / "calib.npz"
-    # Megabytes that do not belong to the lens.
-    points = np.random.default_rng(0).normal(size=(20, 5000, 3))
-    rvecs = np.array([np.zeros(3), np.zeros(2)], dtype=object)  # never unpickled
+    points = np.random.default_rng(0).normal(size=(20, 5000, 3))  # megabytes without a meaning
     save(path, mtx=np.array(K), dist=np.array([PLUMB_BOB]), DIM=np.array([1280, 960]), ret=0.31,
-         objpoints=points, rvecs=rvecs)  # fmt: skip
+         objpoints=points)  # fmt: skip
     described = to_dict(load(path, dtype=f64))
     expected = dict(model="BrownConrady", radial=[-0.22, 0.05, 0.003], tangential=[0.001, -0.002],
                     center=[320, 240], image_size=[960, 1280])  # fmt: skip
     assert described | expected == described
     save(path, cameraMatrix=np.array(K), distCoeffs=np.array(FISHEYE)[:, None])
     assert load(path, coefficients="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
-    save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
-    with pytest.raises(ValueError, match=r"D must be 0 or 4 or .*dtype', 'object'"):
-        load(path)
 
 
 CLOSE = 1.15  # the middles of both orders are so close that only an exact one tells them apart
@@ -121,24 +104,19 @@ def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
             assert str(path) in str(error) and "\n" not in str(error)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("readme.txt", "no array")
-    with pytest.raises(ValueError, match=r"calib\.npz: it is a zip archive, but must be a cal"):
-        load(path)
+    refused(r"calib\.npz: it is a zip archive, but must be a cal", load, path)
 
 
 def test_arrays_of_objects_are_named(tmp_path):
     """They are not unpickled. One that should hold numbers is an error, others are left out."""
     path, shape = tmp_path / "calib.npz", dict(width=1280, height=960, fisheye_model=1)
-    objects = np.array([[{"a": 1}]], dtype=object)
+    rows, entry = np.array([np.zeros(3), np.zeros(2)], dtype=object), np.array([[{}]], dtype=object)
     numbers = dict(K=np.reshape(K, (3, 3)), D=np.array(D[:4]))
     for name in numbers:
         np.savez(path, **numbers | {name: numbers[name].astype(object)}, **shape)
-        with pytest.raises(ValueError, match=rf"{name} must be .*, got \['dtype', 'object'\]"):
-            load(path)
-    np.savez(path, **numbers, rvecs=objects, notes=objects, **shape)
+        refused(rf"{name} must be .*, got \['dtype', 'object'\]", load, path)
+    np.savez(path, **numbers, rvecs=rows, notes=entry, **shape)
     assert load(path).radial.tolist() == [pytest.approx(D[:4])]
-
-
-# -- many cameras, and many numbers ---
 
 
 def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
@@ -148,14 +126,12 @@ def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
     path.write_text("".join(rows))
     lenses = load_all(path, dtype=f64)
     for camera in ("0", "5", "8"):
-        alone = load(path, camera=camera, dtype=f64)
-        for name, value in alone._tensors().items():
+        for name, value in load(path, camera=camera, dtype=f64)._tensors().items():
             torch.testing.assert_close(getattr(lenses[camera], name), value, rtol=1e-12, atol=0)
     for bad in (6, 8):
         rows[bad] = rows[bad].replace("310", "1e-300")
     path.write_text("".join(rows))
-    with pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '6': "):
-        load_all(path)
+    refused(r"COLMAP calibration .*: camera '6': ", load_all, path)
     assert load(path, camera="5").focal.item() == 305
 
 
@@ -174,8 +150,7 @@ def test_a_calibration_with_its_image_points(suffix, tmp_path):
     assert lens.radial.tolist() == [[-0.3, 0.1, 0.01]]
     # So many numbers as coefficients are an error.
     text = path.read_text().replace("image_points", "D").replace("distortion_coefficients", "x")
-    with pytest.raises(ValueError, match="must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers, go"):
-        loads(text)
+    refused("must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers, go", loads, text)
 
 
 def test_binary_files_that_are_wrong(tmp_path):
@@ -183,9 +158,7 @@ def test_binary_files_that_are_wrong(tmp_path):
 
     def error_of(data):
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"calibration .*cameras\.bin") as error:
-            load_all(path)
-        return str(error.value)
+        return refused(r"calibration .*cameras\.bin", load_all, path)
 
     for length in range(8, len(whole), 31):
         assert "it ends within camera" in error_of(whole[:length])

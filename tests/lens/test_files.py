@@ -2,13 +2,14 @@
 
 import json
 import math
+import re
 from itertools import product
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import CALIBRATIONS
+from helpers import CALIBRATIONS, refused
 from lens_examples import (
     FILES,
     FISHEYE,
@@ -33,26 +34,23 @@ from darswin.lens.files.load import Calibration
 from darswin.views import up_of
 
 
-@pytest.mark.parametrize(
-    ("name", "model", "center", "size"),
-    [
-        ("woodscape.json", "Polynomial", (640 + 1.8 - 0.5, 483 + 3.6 - 0.5), (966, 1280)),
-        ("kitti360_02.yaml", "Mei", (708.5, 697.0), (1400, 1400)),
-        ("camodocal_pinhole.yaml", "BrownConrady", (371.4, 236.2), (480, 752)),
-        ("kalibr_ds.yaml", "DoubleSphere", (724.6, 533.8), (1080, 1440)),
-        ("kalibr_omni.yaml", "Mei", (380.6, 243.5), (480, 752)),
-        ("ros_plumb_bob.yaml", "BrownConrady", (312.054718, 236.418205), (480, 640)),
-        ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
-        ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
-        ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
-        # The row comes first, and indices begin at 0.
-        ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
-        # The center of the upper left pixel is (0.5, 0.5).
-        ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
-        ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),
-        ("ours.json", "KannalaBrandt", (319.5, 241.0), (480, 640)),
-    ],
-)
+@pytest.mark.parametrize(("name", "model", "center", "size"), [
+    ("woodscape.json", "Polynomial", (640 + 1.8 - 0.5, 483 + 3.6 - 0.5), (966, 1280)),
+    ("kitti360_02.yaml", "Mei", (708.5, 697.0), (1400, 1400)),
+    ("camodocal_pinhole.yaml", "BrownConrady", (371.4, 236.2), (480, 752)),
+    ("kalibr_ds.yaml", "DoubleSphere", (724.6, 533.8), (1080, 1440)),
+    ("kalibr_omni.yaml", "Mei", (380.6, 243.5), (480, 752)),
+    ("ros_plumb_bob.yaml", "BrownConrady", (312.054718, 236.418205), (480, 640)),
+    ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
+    ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
+    ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
+    # The row comes first, and indices begin at 0.
+    ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
+    # The center of the upper left pixel is (0.5, 0.5).
+    ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
+    ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),
+    ("ours.json", "KannalaBrandt", (319.5, 241.0), (480, 640)),
+])  # fmt: skip
 def test_each_format_keeps_its_pixel_origin(name, model, center, size):
     lens = load(FILES / name, dtype=f64)
     assert type(lens).__name__ == model and len(lens) == 1
@@ -120,74 +118,71 @@ EIGHT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
 
 
-@pytest.mark.parametrize(
-    ("text", "options", "expected"),
-    [
-        *((EUROC.format(word), {}, RADTAN | SIZE)
-          for word in ("radial-tangential", "radial_tangential", "radtan")),
-        (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
-        *((opencv(**{name: PLUMB_BOB}), {}, PLUMB) for name in NAMES),
-        *((opencv(D=PLUMB_BOB, **says), {}, PLUMB)
-          for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0))),
-        *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
-        (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
-        # From NumPy scripts, and from the output of `rostopic echo` and `ros2 topic echo`.
-        (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
-        (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
-         f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
-        *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
-        (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
-         dict(model="Perspective", center=[255.5, 254.5])),
-        # A θ_max beyond the limit by rounding.
-        ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
-         dict(model="Equidistant", focal=300.0)),
-        # The choice of the model.
-        (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
-        (opencv(), dict(coefficients="fisheye"), dict(model="Equidistant")),
-        (fisheye_or_pinhole(), dict(coefficients="fisheye"), KB),
-        (fisheye_or_pinhole(), dict(coefficients="pinhole"), PINHOLE),
-        (fisheye_or_pinhole(fisheye_model=1), {}, KB),
-        (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
-        (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
-        (fisheye_or_pinhole(distortion_model="plumb_bob"), {}, PINHOLE),
-        (fisheye_or_pinhole(camera_model="fisheye"), {}, KB),
-        (fisheye_or_pinhole(xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-        (fisheye_or_pinhole(xi=[[1.1]]), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-        (fisheye_or_pinhole(xi=1.1, model="fisheye"), {}, KB),
-        (FISHEYES["Kalibr"](FISHEYE).replace("equidistant", "radtan"), {}, PINHOLE),
-        (opencv(D=[*PLUMB_BOB, 0, 0]), {}, PLUMB),
-        *((text(FISHEYE), {}, KB) for text in FISHEYES.values()),
-        # The size of the image in every form.
-        *((text, {}, SIZE) for entries in SIZES for text in (sized(**entries), single(**entries))),
-        (sized(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960]), {}, SIZE),
-        # The name decides where the principal point does not.
-        *((sized(K=[[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]], **{name: [1280, 1240]}), {},
-           dict(image_size=size)) for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0))
-          for name, size in (("img_size", [1240, 1280]), ("shape", [1280, 1240]))),
-        # Whether it is a fisheye in any word.
-        *((text, {}, dict(model=model)) for name in ("is_fisheye", "isFisheye", "fisheye")
-          for model, words in (("KannalaBrandt", ("True", "yes", 1, "1", "TRUE")),
-                               ("BrownConrady", ("no", "False", 0)))
-          for value in words
-          for text in (instant_ngp(**{"is_fisheye": None, name: value}),
-                       opencv(D=FISHEYE, **{name: value}))),
-        *((instant_ngp(is_fisheye=value, **entries), {}, dict(model=model))
-          for value, model in ((None, "BrownConrady"), (True, "KannalaBrandt"),
-                               (False, "BrownConrady"))
-          for off in (dict.fromkeys(other, 0) for other in OTHER_CAMERAS)
-          for entries in (off, off | dict(frames=[NGP["frames"][0] | off]))),
-        (instant_ngp(), {}, dict(model="KannalaBrandt", center=[803.0, 596.75],
-                                 radial=[0.0182, -0.0064, 0.0027, -0.0008])),
-        # Single numbers.
-        (flat("k1", "k2", "k3", "k4"), {}, KB | {"center": [643.1, 478.6], "focal": 421.3}),
-        (yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), {}, KB),
-        (flat("k1", "k2", "k3", model="fisheye"), {}, KB | dict(radial=[*FISHEYE[:3], 0.0])),
-        (flat("k1", "k2", "p1", "p2"), {}, PINHOLE | dict(radial=[*FISHEYE[:2], 0.0])),
-        (flat(**dict(zip(EIGHT, RATIONAL, strict=True))), {}, DIVIDED),
-        (flat("k1", "k2", "p1", "p2", fy=421.3, skew=421.3), {}, {"affine": [[1, 1], [0, 1]]}),
-        (flat("k1", "k2", "p1", "p2", xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "options", "expected"), [
+    *((EUROC.format(word), {}, RADTAN | SIZE)
+      for word in ("radial-tangential", "radial_tangential", "radtan")),
+    (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
+    *((opencv(**{name: PLUMB_BOB}), {}, PLUMB) for name in NAMES),
+    *((opencv(D=PLUMB_BOB, **says), {}, PLUMB)
+      for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0))),
+    *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
+    (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
+    # From NumPy scripts, and from the output of `rostopic echo` and `ros2 topic echo`.
+    (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
+    (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
+     f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
+    *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
+    (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
+     dict(model="Perspective", center=[255.5, 254.5])),
+    # A θ_max beyond the limit by rounding.
+    ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
+     dict(model="Equidistant", focal=300.0)),
+    # The choice of the model.
+    (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
+    (opencv(), dict(coefficients="fisheye"), dict(model="Equidistant")),
+    (fisheye_or_pinhole(), dict(coefficients="fisheye"), KB),
+    (fisheye_or_pinhole(), dict(coefficients="pinhole"), PINHOLE),
+    (fisheye_or_pinhole(fisheye_model=1), {}, KB),
+    (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
+    (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
+    (fisheye_or_pinhole(distortion_model="plumb_bob"), {}, PINHOLE),
+    (fisheye_or_pinhole(camera_model="fisheye"), {}, KB),
+    (fisheye_or_pinhole(xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+    (fisheye_or_pinhole(xi=[[1.1]]), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+    (fisheye_or_pinhole(xi=1.1, model="fisheye"), {}, KB),
+    (FISHEYES["Kalibr"](FISHEYE).replace("equidistant", "radtan"), {}, PINHOLE),
+    (opencv(D=[*PLUMB_BOB, 0, 0]), {}, PLUMB),
+    *((text(FISHEYE), {}, KB) for text in FISHEYES.values()),
+    # The size of the image in every form.
+    *((text, {}, SIZE) for entries in SIZES for text in (sized(**entries), single(**entries))),
+    (sized(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960]), {}, SIZE),
+    # The name decides where the principal point does not.
+    *((sized(K=[[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]], **{name: [1280, 1240]}), {},
+       dict(image_size=size)) for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0))
+      for name, size in (("img_size", [1240, 1280]), ("shape", [1280, 1240]))),
+    # Whether it is a fisheye in any word.
+    *((text, {}, dict(model=model)) for name in ("is_fisheye", "isFisheye", "fisheye")
+      for model, words in (("KannalaBrandt", ("True", "yes", 1, "1", "TRUE")),
+                           ("BrownConrady", ("no", "False", 0)))
+      for value in words
+      for text in (instant_ngp(**{"is_fisheye": None, name: value}),
+                   opencv(D=FISHEYE, **{name: value}))),
+    *((instant_ngp(is_fisheye=value, **entries), {}, dict(model=model))
+      for value, model in ((None, "BrownConrady"), (True, "KannalaBrandt"),
+                           (False, "BrownConrady"))
+      for off in (dict.fromkeys(other, 0) for other in OTHER_CAMERAS)
+      for entries in (off, off | dict(frames=[NGP["frames"][0] | off]))),
+    (instant_ngp(), {}, dict(model="KannalaBrandt", center=[803.0, 596.75],
+                             radial=[0.0182, -0.0064, 0.0027, -0.0008])),
+    # Single numbers.
+    (flat("k1", "k2", "k3", "k4"), {}, KB | {"center": [643.1, 478.6], "focal": 421.3}),
+    (yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), {}, KB),
+    (flat("k1", "k2", "k3", model="fisheye"), {}, KB | dict(radial=[*FISHEYE[:3], 0.0])),
+    (flat("k1", "k2", "p1", "p2"), {}, PINHOLE | dict(radial=[*FISHEYE[:2], 0.0])),
+    (flat(**dict(zip(EIGHT, RATIONAL, strict=True))), {}, DIVIDED),
+    (flat("k1", "k2", "p1", "p2", fy=421.3, skew=421.3), {}, {"affine": [[1, 1], [0, 1]]}),
+    (flat("k1", "k2", "p1", "p2", xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+])  # fmt: skip
 def test_what_is_read(text, options, expected):
     described = to_dict(loads(text, dtype=f64, **options))
     assert described | expected == described
@@ -222,21 +217,18 @@ def test_two_texts_of_one_lens(name):
 
 
 def test_frames_of_instant_ngp_may_have_their_own_numbers():
-    frame = NGP["frames"][0]
-    inside = frame | {name: value for name, value in NGP.items() if name != "frames"}
+    inside = NGP["frames"][0] | {name: value for name, value in NGP.items() if name != "frames"}
     frames = dict(frames=[inside, inside | {"file_path": "2", "fl_x": 400.0}])
     first, second = Calibration(json.dumps(frames), "in a string").lenses(dtype=f64).values()
     assert to_dict(first) == to_dict(loads(instant_ngp(), dtype=f64))
     assert second.focal.item() == 400
 
 
-@pytest.mark.parametrize("size", [(2160, 3840), (3840, 2160)])
-@pytest.mark.parametrize("name", ["img_size", "shape"])
-def test_the_order_of_a_size_beside_the_matrix_of_a_smaller_image(name, size):
+def test_the_order_of_a_size_beside_the_matrix_of_a_smaller_image():
     k = [[421.3, 0, 960.0], [0, 421.3, 540.0], [0, 0, 1]]
-    with pytest.warns(ImplausibleLens, match="of 3840 × 2160 px .* would fit 19.. × 10.. px"):
-        lens = loads(sized(K=k, **{name: size}))
-    assert lens.image_size.tolist() == [[2160, 3840]]
+    for name, size in product(("img_size", "shape"), ((2160, 3840), (3840, 2160))):
+        with pytest.warns(ImplausibleLens, match="of 3840 × 2160 px .* would fit 19.. × 10.. px"):
+            assert loads(sized(K=k, **{name: size})).image_size.tolist() == [[2160, 3840]]
 
 
 @pytest.mark.parametrize(("model", "degrees"), [("Equidistant", 360), ("Orthographic", 180)])
@@ -249,20 +241,18 @@ def test_the_largest_angle_is_allowed_however_it_is_given(model, degrees, dtype)
             assert lens.theta_max.item() == pytest.approx(math.radians(degrees / 2), abs=1e-4)
 
 
-def test_a_dict_takes_degrees_like_a_file():
-    lens = from_dict(dict(model="Equidistant", fov_deg=170), (100, 100))
-    assert math.degrees(lens.theta_max.item()) == pytest.approx(85)
-    assert lens.r_max.item() == pytest.approx(50)
+def test_a_field_of_view_fills_the_image():
+    for lens, r_max, theta_max in (
+        (from_dict(dict(model="Equidistant", fov_deg=170), (100, 100)), 50, math.radians(85)),
+        (loads('{"model": "Spherical", "xi": 0.5, "fov": 2.8}', image_size=(40, 60)), 20, 1.4),
+    ):
+        assert lens.r_max.item() == pytest.approx(r_max)
+        assert lens.theta_max.item() == pytest.approx(theta_max)
 
 
 def test_files_of_new_variants_are_read():
-    assert torch.isfinite(load(FILES / "ours_degrees.json").r_max).all()
     assert load(FILES / "ours_degrees.json").r_max.item() == pytest.approx(300)
     assert load(FILES / "numpy_shape.npz").image_size.tolist() == [[768, 1024]]
-    assert load(FILES / "opencv_size_matrix.yaml").image_size.tolist() == [[1200, 1920]]
-    assert list(load_all(FILES / "kalibr_equidistant_five.yaml")) == ["cam0"]
-    for name in ("kalibr_equidistant_five.yaml", "ros_equidistant_five.yaml"):
-        assert load(FILES / name).radial.shape == (1, 4)
 
 
 @pytest.mark.parametrize("name", ["woodscape.json", "synwoodscape.json"])
@@ -275,26 +265,17 @@ def test_up_of_a_vehicles_camera_is_that_of_its_rotation(name):
     assert up[1] < -0.5 and np.linalg.norm(up) == pytest.approx(1)  # the camera stands upright
 
 
-@pytest.mark.parametrize(
-    ("extrinsic", "said"),
-    [
-        (dict(quaternion=[0, 0, 0, 0]), "extrinsic.quaternion must not be zero"),
-        (dict(quaternion=[0, 0, 1]), r"extrinsic\.quaternion must be .*4"),
-        (dict(), "quaternion"),
-        (None, "extrinsic"),
-    ],
-)
+@pytest.mark.parametrize(("extrinsic", "said"), [
+    (dict(quaternion=[0, 0, 0, 0]), "extrinsic.quaternion must not be zero"),
+    (dict(quaternion=[0, 0, 1]), r"extrinsic\.quaternion must be .*4"),
+    (dict(), "quaternion"),
+    (None, "extrinsic"),
+])  # fmt: skip
 def test_files_that_do_not_say_what_is_up(tmp_path, extrinsic, said):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(json.loads(file_text("woodscape.json")) | dict(extrinsic=extrinsic)))
-    with pytest.raises(ValueError, match=said) as error:
-        load_up(path)
-    assert str(path) in str(error.value)
-    with pytest.raises(ValueError, match="Kalibr files do not say which way is up"):
-        load_up(FILES / "kalibr_tumvi.yaml")
-
-
-# -- missing information ------------------------------------------------------------------------
+    refused(f"{re.escape(str(path))}.*{said}", load_up, path)
+    refused("Kalibr files do not say which way is up", load_up, FILES / "kalibr_tumvi.yaml")
 
 
 def test_theta_max_is_the_widest_side():
@@ -339,7 +320,7 @@ def test_several_cameras():
     assert loads(json.dumps(same)).focal.item() == pytest.approx(851.2)
     # A stereo pair of OpenCV.
     pair = dict(M1=K, D1=[0.1, 0, 0, 0, 0], M2=K, D2=[0.2, 0, 0, 0, 0], width=640, height=480)
-    lenses = Calibration(json.dumps(pair), "in a string").lenses(dtype=f64).values()
+    lenses = [loads(json.dumps(pair), camera=k, dtype=f64) for k in ("1", "2")]
     assert [lens.radial[0, 0].item() for lens in lenses] == [0.1, 0.2]
     assert load(FILES / "basalt.json", camera="cam4").image_size.tolist() == [[480, 640]]
     # If the names are numbers, a number is a name.
@@ -349,8 +330,3 @@ def test_several_cameras():
     # A camera with a missing entry is an error only if it is read.
     text = file_text("kalibr_tumvi.yaml").replace("camera_model", "model", 1)
     assert loads(text, camera="cam1").focal.item() == focal
-
-
-def test_our_own_json_may_say_a_field_of_view():
-    lens = loads('{"model": "Spherical", "xi": 0.5, "fov": 2.8}', image_size=(40, 60))
-    assert lens.r_max.item() == pytest.approx(20) and lens.theta_max.item() == pytest.approx(1.4)

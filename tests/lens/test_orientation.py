@@ -4,6 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 
@@ -16,22 +17,17 @@ f64 = torch.float64
 SIZE = (5, 7)
 
 
-def where_pixels_went(orientation: int) -> torch.Tensor:
-    """(H, W, 2): the stored x and y of each pixel of the picture that Pillow makes upright."""
+def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
+    """Places (..., 2) in the upright picture of stored places, by Pillow's pixels."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.uint8)
     image = Image.fromarray(np.stack((x, y, y), -1))
     image.getexif()[ExifTags.Base.Orientation] = orientation
-    return torch.from_numpy(np.asarray(ImageOps.exif_transpose(image))[..., :2].astype(np.float64))
-
-
-def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
-    """Places (..., 2) in the upright picture of stored places, by Pillow's pixels."""
-    went = where_pixels_went(orientation)
+    # (H, W, 2): the stored x and y of each pixel of the picture that Pillow makes upright.
+    went = torch.from_numpy(np.asarray(ImageOps.exif_transpose(image))[..., :2].astype(float))
     height, width = went.shape[:2]
     corner, right, down = went[0, 0], went[0, 1] - went[0, 0], went[1, 0] - went[0, 0]
-    assert torch.equal(
-        went[height - 1, width - 1], corner + (width - 1) * right + (height - 1) * down
-    )
+    last = corner + (width - 1) * right + (height - 1) * down
+    assert torch.equal(went[height - 1, width - 1], last)
     return (points - corner) @ torch.linalg.inv(torch.stack((right, down)))
 
 
@@ -55,8 +51,7 @@ def test_a_ray_lands_where_its_pixel_went(lens, orientation, theta, azimuth):
     oriented = upright(lens, orientation)
     assert stored_size(tuple(oriented.image_size[0].int().tolist()), orientation) == SIZE
     direction = torch.tensor([[np.cos(azimuth), np.sin(azimuth)]], dtype=f64)
-    origin = torch.zeros(2, dtype=f64)
-    turn = from_stored(direction, orientation) - from_stored(origin, orientation)
+    turn = from_stored(direction, orientation) - from_stored(torch.zeros(2, dtype=f64), orientation)
     theta = torch.tensor([theta], dtype=f64)
     expected = from_stored(lens.pixels(theta, direction), orientation)
     torch.testing.assert_close(oriented.pixels(theta, turn), expected, atol=1e-9, rtol=0)
@@ -86,24 +81,16 @@ def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
     assert torch.equal(in_upright_picture(lens, (48, 64), 6).center, lens.center)
     with pytest.raises(ValueError, match=r"is 50×50: .* \(as stored; its EXIF orientation is 8"):
         in_upright_picture(lens, (50, 50), 8)
-    with pytest.raises(ValueError, match="orientation must be 1 to 8, got 9"):
-        upright(lens, 9)
-    with pytest.raises(ValueError, match="needs an image_size"):
-        upright(Equidistant(20.0), 6)
+    refused("orientation must be 1 to 8, got 9", upright, lens, 9)
+    refused("needs an image_size", upright, Equidistant(20.0), 6)
+    refused("takes one lens, got 2", rotated, Equidistant([9.0, 8.0], image_size=SIZE), 0.1)
+    refused("image_size", rotated, Equidistant(9.0), 0.1)
 
 
 @given(lenses, st.floats(-3.2, 3.2), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))
 def test_a_ray_lands_where_its_pixel_was_turned_to(lens, angle, theta, azimuth):
     after, matrix = rotated(lens, angle)
-    before = lens.project_rays(theta, azimuth)
-    place = before @ matrix[:, :2].T + matrix[:, 2]
+    place = lens.project_rays(theta, azimuth) @ matrix[:, :2].T + matrix[:, 2]
     torch.testing.assert_close(after.project_rays(theta, azimuth + angle), place)
     if lens.affine is None:  # then lengths stay the same
         torch.testing.assert_close(matrix[:, :2] @ matrix[:, :2].T, torch.eye(2, dtype=f64))
-
-
-def test_rotated_takes_one_lens_that_knows_its_middle():
-    with pytest.raises(ValueError, match="takes one lens, got 2"):
-        rotated(Equidistant([9.0, 8.0], image_size=SIZE), 0.1)
-    with pytest.raises(ValueError, match="image_size"):
-        rotated(Equidistant(9.0), 0.1)

@@ -35,14 +35,13 @@ F, CX, CY = 850.0, 965.0, 533.0  # px
 PIXEL = 0.0031  # mm
 
 
-def fisheye(fx=F, cx=CX, cy=CY, fy=None, size=(H, W)) -> Lens:
+def fisheye(fx=F, cx=CX, cy=CY, fy=None, size=(H, W), model=KannalaBrandt, radial=FISHEYE) -> Lens:
     affine = None if fy is None else [[1.0, 0.0], [0.0, fy / fx]]
-    return KannalaBrandt(fx, FISHEYE, None, [cx, cy], affine=affine, image_size=size)
+    return model(fx, radial, None, [cx, cy], affine=affine, image_size=size)
 
 
-def pinhole(fx=F, cx=CX, cy=CY, fy=None, size=(H, W)) -> Lens:
-    affine = None if fy is None else [[1.0, 0.0], [0.0, fy / fx]]
-    lens = BrownConrady(fx, [0.02, 0.001], None, [cx, cy], affine=affine, image_size=size)
+def pinhole(*plane) -> Lens:
+    lens = fisheye(*plane, model=BrownConrady, radial=[0.02, 0.001])
     return lens.with_theta_max(lens.side_angles().amax(1))
 
 
@@ -82,8 +81,7 @@ WRONG = [
 @pytest.mark.parametrize(("arguments", "pattern"), WRONG, ids=str)
 def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     lens = make(*arguments)
-    lens = lens.with_theta_max(lens.side_angles().amax(1))
-    (doubt,) = doubts(lens)
+    (doubt,) = doubts(lens.with_theta_max(lens.side_angles().amax(1)))
     assert re.search(pattern, doubt) and re.match(r"a picture of \d+ × \d+ px with ", doubt), doubt
     assert "\n" not in doubt and len(doubt) < 250
 
@@ -106,13 +104,11 @@ def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
 
 def genuine():
     """Lenses of examples and files, and crops and resizings of them."""
-    files = [*FILES.iterdir(), FILES.parents[2] / "examples" / "front.json"]
-    for path in files:
+    for path in [*FILES.iterdir(), FILES.parents[2] / "examples" / "front.json"]:
         if path.name != "README.md":
-            file = Calibration.read(path, "fisheye" if "ambiguous" in path.name else None)
+            file = Calibration.read(path)
             for name in file.names:
-                lens = file.lens(name, image_size=(960, 1280), dtype=f64)
-                yield f"{path.name} {name}", lens
+                yield f"{path.name} {name}", file.lens(name, image_size=(960, 1280), dtype=f64)
     yield "front", FRONT
     for text in (flat("k1", "k2", "k3", "k4"), opencv(D=PLUMB_BOB), message()):
         yield text, loads(text, dtype=f64)
@@ -168,19 +164,16 @@ def test_rare_but_real_lenses_are_not_doubted(name):
 def test_any_numbers_get_a_doubt_of_one_line():
     extremes = (1e-300, 1e-30, 1e-3, 1.0, 1e30, 1e300)
     for focal, x, y, stretch in itertools.product(extremes, extremes, (-1.0, *extremes), extremes):
-        lens = Equidistant(
-            torch.tensor(focal, dtype=f64), 1.0, [x, y], affine=[[stretch, 0.0], [0.0, 1.0]],
-            image_size=(480, 640),
-        )  # fmt: skip
+        affine, focal = [[stretch, 0.0], [0.0, 1.0]], torch.tensor(focal, dtype=f64)
+        lens = Equidistant(focal, 1.0, [x, y], affine=affine, image_size=(480, 640))
         (doubt,) = doubts(lens)
         assert doubt.startswith("a picture of 640 × 480 px with ") and len(doubt) < 300, doubt
 
 
 def test_a_batch_is_doubted_lens_by_lens():
     lens = Equidistant([300.0, 0.9, 310.0], 1.6, image_size=(640, 640))
-    found = doubts(lens)
-    assert [bool(doubt) for doubt in found] == [False, True, False]
-    assert found == [doubts(lens[i])[0] for i in range(3)]
+    assert [bool(doubt) for doubt in doubts(lens)] == [False, True, False]
+    assert doubts(lens) == [doubts(lens[i])[0] for i in range(3)]
     assert doubts(Equidistant([3.0, 4.0])) == ["", ""]  # without a picture
     rows = torch.tensor([[200.0, 0.0], [50.0, 300.0]], requires_grad=True)
     assert len(doubts(Equidistant(torch.tensor(9.0), center=rows, image_size=(9, 9)))) == 2
@@ -223,11 +216,10 @@ def test_many_cameras_give_one_warning(tmp_path):
     assert not warned(lambda: load(path, camera=2)) and warned(lambda: load(path, camera=3))
 
 
-@pytest.mark.parametrize(
-    ("binning", "roi"),
-    [((0, 0), (101, 52, 640, 483)), ((2, 2), (0, 0, 300, 200)), ((3, 2), (900, 700, 380, 260)),
-     ((2, 2), (0, 0, 0, 0))],
-)  # fmt: skip
+@pytest.mark.parametrize(("binning", "roi"), [
+    ((0, 0), (101, 52, 640, 483)), ((2, 2), (0, 0, 300, 200)), ((3, 2), (900, 700, 380, 260)),
+    ((2, 2), (0, 0, 0, 0)),
+])  # fmt: skip
 def test_the_region_of_a_message_is_a_crop(binning, roi):
     assert not warned(lambda: loads(message(binning, roi)))
     quarter = json.dumps([[value / 4 for value in row] for row in K[:2]] + [[0, 0, 1]])

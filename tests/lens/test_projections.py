@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import changed
+from helpers import changed, refused
 from lens_examples import (
     CALIBRATIONS,
     DEGREES,
@@ -55,10 +55,6 @@ def pinhole(points, d, k=K):
     return cv2.projectPoints(points, zero, zero, np.array(k), np.array(d))[0][:, 0]
 
 
-def assert_pinhole(lens, d, k=K):
-    assert_projects(lens, points_around(0.7), pinhole(points_around(0.7), d, k))
-
-
 @pytest.mark.parametrize(("suffix", "alpha"), [("yaml", 0.003), ("xml", 0.0), ("json", 0.003)])
 def test_opencv_fisheye(tmp_path, suffix, alpha):
     k = np.array(K)
@@ -85,7 +81,7 @@ def test_opencv_pinhole(tmp_path, suffix, d):
     path = write(tmp_path / f"c.{suffix}", camera_matrix=K, distortion_coefficients=d,
                  image_width=1280, image_height=960)  # fmt: skip
     lens = load(path, coefficients="pinhole", dtype=f64)
-    assert_pinhole(lens, d)
+    assert_projects(lens, points_around(0.7), pinhole(points_around(0.7), d))
     assert lens.is_radial == (not any(d[2:4]) and not any(d[8:]))
     if not any(d):
         assert type(lens).__name__ == "Perspective"
@@ -119,30 +115,24 @@ def colmap_pixels(model, params, points):
     if "FISHEYE" in model:
         theta = np.arctan2(np.hypot(x, y), z)
         u, v = theta * x / np.hypot(x, y), theta * y / np.hypot(x, y)
-    terms = dict(k=extra)
-    if model == "FULL_OPENCV":
-        terms = dict(k=[*extra[:2], extra[4]], p=extra[2:4], d=extra[5:])
-    elif model == "OPENCV":
-        terms = dict(k=extra[:2], p=extra[2:])
-    elif model == "BROWN_CONRADY":
-        terms = dict(k=extra[:3], p=extra[3:])
-    elif model == "THIN_PRISM_FISHEYE":
-        terms = dict(k=[*extra[:2], *extra[4:6]], p=extra[2:4], s=[extra[6], 0, extra[7], 0])
-    elif model == "RAD_TAN_THIN_PRISM_FISHEYE":
-        radial = 1 + sum(c * (u * u + v * v) ** i for i, c in enumerate(extra[:6], 1))
-        u, v, terms = u * radial, v * radial, dict(p=extra[7:5:-1], s=extra[8:])
+    r2, factor = u * u + v * v, 1.0
+    if model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        factor = 1 + sum(c * r2**i for i, c in enumerate(extra[:6], 1))
     elif model == "FOV":
-        r = np.hypot(u, v)
-        radial = np.arctan(2 * r * np.tan(extra[0] / 2)) / (r * extra[0])
-        u, v, terms = u * radial, v * radial, {}
+        factor = np.arctan(2 * r2**0.5 * np.tan(extra[0] / 2)) / (r2**0.5 * extra[0])
     elif model == "EUCM":
-        alpha, beta = extra
-        den = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
-        u, v, terms = x / den, y / den, {}
+        factor = z / (extra[0] * np.sqrt(extra[1] * (x * x + y * y) + z * z) + (1 - extra[0]) * z)
     elif "DIVISION" in model:
-        den = (z + np.sqrt(z * z - 4 * (x * x + y * y) * extra[0])) / 2
-        u, v, terms = x / den, y / den, {}
-    return distorted(u, v, plane, **terms)
+        factor = 2 * z / (z + np.sqrt(z * z - 4 * (x * x + y * y) * extra[0]))
+    terms = {
+        "FULL_OPENCV": lambda: dict(k=[*extra[:2], extra[4]], p=extra[2:4], d=extra[5:]),
+        "OPENCV": lambda: dict(k=extra[:2], p=extra[2:]),
+        "BROWN_CONRADY": lambda: dict(k=extra[:3], p=extra[3:]),
+        "THIN_PRISM_FISHEYE": lambda: dict(
+            k=[*extra[:2], *extra[4:6]], p=extra[2:4], s=[extra[6], 0, extra[7], 0]),
+        "RAD_TAN_THIN_PRISM_FISHEYE": lambda: dict(p=extra[7:5:-1], s=extra[8:]),
+    }.get(model, lambda: {} if isinstance(factor, np.ndarray) else dict(k=extra))()  # fmt: skip
+    return distorted(u * factor, v * factor, plane, **terms)
 
 
 @pytest.mark.slow
@@ -241,8 +231,7 @@ def test_ocamcalibs_polynomials_are_held_against_each_other():
         with pytest.raises(ValueError, match=r"must undo the direct one .* px for [\d.]+ px"):
             loads(ocam(DIRECT, INVERSE.replace(old, new)))
     for old, new in (("e+02", "e+021"), ("e-03", "e-031")):
-        with pytest.raises(ValueError, match=r"must undo|such that a₀"):
-            loads(ocam(DIRECT.replace(old, new), INVERSE))
+        refused(r"must undo|such that a₀", loads, ocam(DIRECT.replace(old, new), INVERSE))
 
 
 def test_scaramuzzas_axis_may_point_either_way():
@@ -284,11 +273,10 @@ def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
         assert lens.unproject(torch.tensor([1.01, 2.0, 100.0], dtype=dtype) * end).isnan().all()
 
 
-@pytest.mark.parametrize(
-    ("binning", "roi"),
-    [((0, 0), (101, 52, 640, 483)), ((1, 1), (0, 0, 1280, 960)), ((2, 2), (0, 0, 1280, 960)),
-     ((1, 4), (0, 0, 0, 0)), ((3, 2), (101, 52, 640, 483))],
-)  # fmt: skip
+@pytest.mark.parametrize(("binning", "roi"), [
+    ((0, 0), (101, 52, 640, 483)), ((1, 1), (0, 0, 1280, 960)), ((2, 2), (0, 0, 1280, 960)),
+    ((1, 4), (0, 0, 0, 0)), ((3, 2), (101, 52, 640, 483)),
+])  # fmt: skip
 def test_binned_regions_show_what_the_sensor_sees(binning, roi):
     whole = loads(message(), dtype=f64)
     lens = loads(message(binning, roi), dtype=f64).with_theta_max(None)

@@ -82,8 +82,7 @@ def test_radii_and_angles_undo_each_other_and_nothing_else_lands(lens, data):
 def test_a_resized_or_cropped_lens_sees_the_same(lens, scale, data):
     share = data.draw(st.floats(0, 0.98))
     theta, azimuth = share * lens.theta_max[:, None], torch.tensor([[-2.5, 0.0, 1.0]], dtype=f64)
-    size = None if lens.image_size is not None else (480, 640)
-    pixels = lens.project_rays(theta, azimuth, size)
+    pixels = lens.project_rays(theta, azimuth, None if lens.image_size is not None else (480, 640))
     tolerance = 1e-9 * (1 + pixels.abs().max().item())
     if lens.center is None:
         return
@@ -154,9 +153,9 @@ def test_samples_of_any_grid_stand_in_their_patches(lens, rings, sectors, data):
         torch.testing.assert_close(grid.borders, steps, rtol=1e-9, atol=1e-9)
 
 
-numbers = st.one_of(
-    st.floats(), st.sampled_from([0.0, -1.0, 1e-300, 1e300, math.nan, math.inf, 1.0, 100.0])
-)
+special = st.sampled_from([0.0, -1.0, 1e-300, 1e300, math.nan, math.inf, 1.0, 100.0])
+numbers = st.one_of(st.floats(), special)
+rows_of_numbers = st.lists(numbers, max_size=5)
 
 
 @hypothesis.given(name=st.sampled_from(sorted(MODELS)), data=st.data())
@@ -165,12 +164,7 @@ def test_any_numbers_make_a_lens_that_rises_or_an_error_in_a_sentence(name, data
     for key in (*model.parameters, *model.optional):
         if key in model.optional and data.draw(st.booleans()):
             continue
-        width = data.draw(st.integers(0, 5))
-        values[key] = (
-            data.draw(st.lists(numbers, min_size=width, max_size=width))
-            if len(model.declared[key].shape)
-            else data.draw(numbers)
-        )
+        values[key] = data.draw(rows_of_numbers if len(model.declared[key].shape) else numbers)
     if data.draw(st.booleans()):
         values["theta_max"] = data.draw(numbers)
     tensors = {key: torch.tensor(value, dtype=f64) for key, value in values.items()}

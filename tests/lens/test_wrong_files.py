@@ -4,7 +4,7 @@ import json
 from itertools import pairwise
 
 import pytest
-from helpers import changed, few_calls
+from helpers import changed, few_calls, refused
 from lens_examples import (
     FISHEYE,
     FISHEYES,
@@ -25,7 +25,7 @@ K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 FRAME = {"fl_x": 800.0, "fl_y": 800.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 COLMAP = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
-TUMVI, ROS2 = file_text("kalibr_tumvi.yaml"), file_text("ros2_echo.yaml")
+TUMVI = file_text("kalibr_tumvi.yaml")
 
 # For each file: its format, and the replaced text, its replacement, and the words of the error.
 CHANGED = {
@@ -159,7 +159,6 @@ TEXTS = (
     ("{}", 'The formats are darswin, WoodScape'), ("[1, 2]", "it must be a mapping"),
     ("word", "it must be a mapping"), ("", "it must not be empty"), (" \n\t\n", "be empty"),
     ("a: [1, 2", "not valid YAML: line 1: expected"), ("a: 1\n---\nb: 1", "not valid YAML"),
-    (ROS2 + ROS2, "it is not valid YAML: line"),
     ("a: \x00", "it is not valid YAML"), ('a: "\\UFFFFFFFF"', "it is not valid YAML"),
     # The choice of the camera.
     (TUMVI, "several cameras, choose one with `camera`: 'cam0', 'cam1'"),
@@ -299,27 +298,18 @@ def words(said):
 @pytest.mark.parametrize("case", CASES, ids=lambda case: words(case[1])[0][-40:])
 def test_errors_say_what_is_wrong(case):
     text, said, *options = case
-    with pytest.raises(ValueError) as error:
-        loads(text, **dict(*options))
-    assert all(part in str(error.value) for part in (*words(said), "calibration in a string: "))
-    assert len(str(error.value)) < 1000
+    found = refused("calibration in a string: ", loads, text, **dict(*options))
+    assert all(part in found for part in words(said)) and len(found) < 1000
 
 
-# -- dicts and arguments --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("entries", "said"),
-    [
-        (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
-        (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
-        (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
-        (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
-    ],
-)
+@pytest.mark.parametrize(("entries", "said"), [
+    (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
+    (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
+    (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
+    (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
+])  # fmt: skip
 def test_dicts_are_refused_like_files(entries, said):
-    with pytest.raises(ValueError, match=said):
-        from_dict(dict(model="Equidistant") | entries, (100, 100))
+    refused(said, from_dict, dict(model="Equidistant") | entries, (100, 100))
 
 
 # -- hostile and large files --------------------------------------------------------------------
@@ -334,46 +324,43 @@ def frames(count, **shared):
     return json.dumps({"frames": entries} | shared)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"a":' * 100_000, "nested"),
-        ("a: " + "[" * 100_000, "nested"),
-        ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most 256 KiB"),
-        ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
-        ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
-        (BOMB, "The formats are"),
-        (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
-         "image_height must be a whole number"),
-        (BOMB + "K: *j\n", "K must be 9 finite numbers"),
-        (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
-        ("a: &a [*a]\n", "it is not valid YAML"),
-        ("a: &a {b: *a}\nK: *a\n", "it is not valid YAML"),
-        ('<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><l><K>&a;</K></l>', "DOCTYPE"),
-        ('<!DOCTYPE l SYSTEM "file:///etc/passwd"><l/>', "DOCTYPE"),
-        ('{"K": ' + "9" * 5000 + "}", "it is not valid JSON"),
-        ('{"intrinsic": {"model": "radial_poly", "poly_order": 1, "k1": 1' + "0" * 400 + "}}",
-         "k1 must be a fin"),
-        ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
-        ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
-        ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
-        ("1 " * 1_000_000, "it is a table of 1 lines, but a table must have 5 lines of numbers"),
-        pytest.param("2 1 1\n" * 400_000, "it must have 5 lines", marks=pytest.mark.slow),
-        ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
-        ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
-        ("".join(f"{i} FOV\n" for i in range(9_000)), "camera '0', must have an id"),
-        pytest.param("1 FOV\n" * 100_000, "camera '1' appears twice", marks=pytest.mark.slow),
-        ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
-        (json.dumps({"model": "Polynomial", "coefficients": [1.0] * 20_000}), "at most 64 numbers"),
-        (frames(9_000), "several cameras"),
-        pytest.param(frames(120_000), "1 to 10000 cameras, got 120000", marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "message"), [
+    ('{"a":' * 100_000, "nested"),
+    ("a: " + "[" * 100_000, "nested"),
+    ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most 256 KiB"),
+    ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
+    ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
+    (BOMB, "The formats are"),
+    (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
+     "image_height must be a whole number"),
+    (BOMB + "K: *j\n", "K must be 9 finite numbers"),
+    (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
+    ("a: &a [*a]\n", "it is not valid YAML"),
+    ("a: &a {b: *a}\nK: *a\n", "it is not valid YAML"),
+    ('<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><l><K>&a;</K></l>', "DOCTYPE"),
+    ('<!DOCTYPE l SYSTEM "file:///etc/passwd"><l/>', "DOCTYPE"),
+    ('{"K": ' + "9" * 5000 + "}", "it is not valid JSON"),
+    ('{"intrinsic": {"model": "radial_poly", "poly_order": 1, "k1": 1' + "0" * 400 + "}}",
+     "k1 must be a fin"),
+    ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
+    ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
+    ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
+    ("1 " * 1_000_000, "it is a table of 1 lines, but a table must have 5 lines of numbers"),
+    pytest.param("2 1 1\n" * 400_000, "it must have 5 lines", marks=pytest.mark.slow),
+    ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
+    ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
+    ("".join(f"{i} FOV\n" for i in range(9_000)), "camera '0', must have an id"),
+    pytest.param("1 FOV\n" * 100_000, "camera '1' appears twice", marks=pytest.mark.slow),
+    ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
+    (json.dumps({"model": "Polynomial", "coefficients": [1.0] * 20_000}), "at most 64 numbers"),
+    (frames(9_000), "several cameras"),
+    pytest.param(frames(120_000), "1 to 10000 cameras, got 120000", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with few_calls(1_000_000), pytest.raises(ValueError, match=message) as error:
-        loads(text)
-    assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
+    with few_calls(1_000_000):
+        found = refused(message, loads, text)
+    assert len(found) < 1000 and not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
