@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from darswin import create_model, frames, optimize
+from darswin.deploy.export import export_program
 from darswin.lens import Equidistant
 from darswin.models import LensAdapter
 from darswin.views import list_views, make_view
@@ -209,23 +210,10 @@ def result_of(model, path, images, folder):
     if path == "optimized":
         return optimize(model)(images, LENS)
     if path == "export":
-        return torch.export.export(
-            Fixed(model), (images,), strict=False
-        ).module()(images)  # fmt: skip
+        return export_program(model, images, LENS, fixed_lens=True).module()(images)
     frames.export(model, LENS, SIZE, folder / "n.npz")
     frame = images[0].permute(1, 2, 0).contiguous().numpy()
     return torch.from_numpy(frames.Network(folder / "n.npz")(frame))[None]
-
-
-class Fixed(nn.Module):
-    """A model with a lens of its own."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
-
-    def forward(self, images):
-        return self.model(images, LENS)
 
 
 @torch.no_grad()
