@@ -25,7 +25,12 @@ from darswin.deploy.own import (
 from darswin.deploy.program import RUN, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
-from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
+from darswin.layers.quantized import (
+    Quantization,
+    QuantizedLinear,
+    quantize,
+    quantized_layers,
+)
 
 __all__ = ["fastest_dtype"]
 
@@ -104,8 +109,8 @@ class Own:
 class OneDNN(Own):
     """oneDNN's products in bfloat16 and of quantized layers, and our own in float32.
 
-    Each layer is an operator, but a sum and the norm of it are one. Without oneDNN, torch computes
-    the products in bfloat16.
+    Each layer is an operator, but a sum and the norm of it are one. Where oneDNN lacks a kind of
+    product, torch computes those in bfloat16, and our own operators those of quantized layers.
     """
 
     def __init__(self, dtype: torch.dtype):
@@ -233,7 +238,11 @@ def onednn_linear(weight: Tensor, bias: Tensor | None, *, gelu: bool = False) ->
 
 
 def _quantized_product(layer: QuantizedLinear, result: Quantization | None) -> Layer:
-    """A quantized layer by oneDNN: float32, or its GELU as uint8 of the quantization `result`."""
+    """A quantized layer: float32, or its GELU as uint8 of the quantization `result`. By oneDNN if
+    its sums are exact here."""
+    if onednn_lack(torch.int8) is not None:
+        own = OwnLinear(packed_weights(layer), layer.out_features, gelu=result is not None)
+        return own if result is None else lambda q: quantize(own(q), result)
     columns, dtype = layer.out_features, torch.float32 if result is None else torch.uint8
     weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
     zero_points = torch.zeros(columns, dtype=torch.int64)

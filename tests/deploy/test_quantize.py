@@ -23,6 +23,7 @@ from darswin.layers.quantized import (
     quantized_layers,
     with_quantized_layers,
 )
+from darswin.layers.transformer import Mlp
 from darswin.lens import Spherical
 from darswin.models import ModelCard, load_model, save_model
 from darswin.ops import _module
@@ -218,6 +219,21 @@ def test_fastest(monkeypatch):
     want = optimize(quantized, torch.int8)(*seen)
     assert torch.equal(optimize(quantized, "fastest")(*seen), want)
     assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
+def test_the_largest_sums_do_not_overflow(name):
+    """CPUs without VNNI may add the products of two bytes in 16 bits, where 2 · 255 · 127 is too
+    large. The blocks of DAT have no windows: they are computed layer by layer."""
+    model, (images, lens) = network(name), batch()
+    for layer in model.modules():
+        if isinstance(layer, Mlp):
+            layer.fc1.bias.fill_(4.0)  # then the GELU of every token is as large
+            layer.fc2.weight.abs_()
+    quantized = quantize_model(model, [(images, lens)], tolerance=math.inf)
+    found = optimize(quantized, torch.int8)(images, lens)
+    assert relative_error(found, quantized(images, lens)) < 0.01
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -12,8 +13,12 @@ from test_blocks import every_stage, stage
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import OneDNN, Own
-from darswin.layers.linear import onednn_lack
-from darswin.layers.quantized import QuantizedLinear, quantize, with_quantized_layers
+from darswin.layers.quantized import (
+    Quantization,
+    QuantizedLinear,
+    quantize,
+    with_quantized_layers,
+)
 from darswin.ops import _module, cpu_capability
 
 OPS = torch.ops.darswin
@@ -54,23 +59,33 @@ def test_sums_are_exact(rows, depth, columns, zero_point, weight, value, seed):
     torch.manual_seed(seed)
     linear = layer(depth, columns, (1.0, zero_point), weight=weight)
     q = tokens(rows, depth, value=value)
-    got = OPS._linear(q, packed_weights(linear), columns, False)
     sums = (q.int() - zero_point) @ linear.weight.int().t()
-    assert sums.dtype == torch.int32 and torch.equal(got, sums.float())
+    assert sums.dtype == torch.int32
+    for library in (Own(), OneDNN(torch.float32)):  # which is our own where oneDNN overflows
+        assert torch.equal(library.linear(linear)(q), sums.float())
 
 
-@pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="oneDNN has no products of 8 bits")
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize("size", [(1, 1, 1), (33, 130, 50), (64, 96, 288), (20, 1536, 384)])
-def test_bits_are_those_of_onednn(size, bias):
+def test_products_are_exact_but_for_roundings(size, bias):
     rows, depth, columns = size
     linear = layer(depth, columns, (0.0317, 119), bias=bias)
     linear.weight_scale = torch.rand(columns) / 100
     if bias:
         linear.bias = torch.randn(columns)
-    q = tokens(2, rows, depth)
-    got = OPS._linear(q, packed_weights(linear), columns, False)
-    assert torch.equal(got, OneDNN(torch.float32).linear(linear)(q))
+    q, library = tokens(2, rows, depth), OneDNN(torch.float32)
+    sums = ((q.int() - 119) @ linear.weight.int().t()).double()
+    product, bias = (
+        sums * 0.0317 * linear.weight_scale,
+        linear.bias if bias else torch.zeros(columns),
+    )
+    most = 4 * torch.finfo(torch.float32).eps * (product.abs() + bias.abs())  # of four roundings
+    for one in (Own(), library):
+        assert ((one.linear(linear)(q) - (product + bias)).abs() <= most).all()
+    result = Quantization(0.05, 30)  # of an MLP's first product: its GELU, in 8 bits
+    want = F.gelu(product + bias) / result.scale + result.zero_point
+    found = library.linear(linear, gelu=True, result=result)(q)
+    assert found.dtype == torch.uint8 and (found - want.clamp(0, 255)).abs().max() < 0.501
 
 
 def test_merging():
@@ -156,6 +171,16 @@ def test_wrong_arguments():
     ):  # fmt: skip
         with pytest.raises(RuntimeError, match="_linear"):
             OPS._linear(x, packed, columns, False)
+
+
+def test_any_parameters_are_safe():
+    """A file may hold any. A sanitizer sees sums that overflow."""
+    norm = norm_parameters(torch.nn.LayerNorm(37)), 1e-5
+    packed = packed_weights(layer(37, 50))
+    for value in (-(2**31), 2**31 - 1):
+        given = torch.full_like(packed, value)
+        assert OPS._linear(tokens(9, 37), given, 50, False).shape == (9, 50)
+        assert OPS._linear(torch.randn(9, 37), given, 50, True, *norm).shape == (9, 50)
 
 
 EXTREMES = [(255, 127), (255, -127), (255, -128), (0, -128), (None, None)]
