@@ -235,9 +235,20 @@ def test_the_modules_ask_for_nothing_newer_than_manylinux_2_28(path):
         assert tuple(map(int, version.split("."))) <= newest[library], f"{library}_{version}"
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems need no portable.cpp")
+def test_a_program_with_the_core_copies_exceptions(tmp_path):
+    """What portable.cpp defines for modules would call itself without end in a program."""
+    sources = ROOT / "tests/cpp/exceptions.cpp", ROOT / "csrc/core/portable.cpp"
+    output("g++", "-std=c++20", *sources, "-o", tmp_path / "program")
+    assert output(tmp_path / "program") == "copied\n"
+
+
 def test_a_module_that_cannot_be_loaded_is_explained(monkeypatch, tmp_path):
     monkeypatch.setattr(_module, "FILE", tmp_path / "libdarswin.so")
-    with pytest.raises(ImportError, match=f"no compiled module, {_module.FILE}: its wheel is"):
+    with pytest.raises(
+        ImportError, match=re.escape(f"no compiled module, {_module.FILE}: its wheel is")
+    ):
         _module.load()
     _module.FILE.write_bytes(b"not a library")
     with pytest.raises(ImportError) as caught:

@@ -124,7 +124,8 @@ def quantized_of(model):
 def test_quantized_networks_compute_with_8_bits(family, options, own, tmp_path, monkeypatch):
     model = model_of(family, **options)
     quantized = quantized_of(model)
-    expected_of = optimize(quantized, torch.int8)
+    with packed.own_alone():  # oneDNN rounds in another order
+        expected_of = optimize(quantized, torch.int8)
     monkeypatch.setattr(packed, "has_own_int8", lambda: own)  # False: this CPU has AMX
     network = network_of(quantized, tmp_path)
     frame = random_frame(*network.size, 3, seed=7)
@@ -455,7 +456,7 @@ def test_the_c_interface(tmp_path):
     pointer, number, text = ctypes.c_void_p, ctypes.c_int64, ctypes.c_char_p
     for name, result, *arguments in (
         ("version", text), ("file_version", text), ("last_error", text), ("load", pointer, text),
-        ("free", None, pointer), ("frame_size", ctypes.c_int, pointer, number * 3),
+        ("free", None, pointer), ("frame_size", ctypes.c_int, pointer, pointer),
         ("output_count", number, pointer), ("output_axes", number, pointer, number),
         ("output_shape", ctypes.POINTER(number), pointer, number),
         ("output_numbers", number, pointer, number), ("label_count", number, pointer),
@@ -479,6 +480,8 @@ def test_the_c_interface(tmp_path):
         size = (number * 3)()
         assert library.darswin_frame_size(loaded, size) == 0
         assert tuple(size) == (*network.size, 3)
+        assert library.darswin_frame_size(loaded, None) == -1
+        assert b"size must not be NULL" in library.darswin_last_error()
         assert library.darswin_output_count(loaded) == len(expected)
         outs = []
         for k, right in enumerate(expected):
@@ -549,5 +552,6 @@ def test_networks_run_without_torch_in_little_memory_on_every_tier(tier, tmp_pat
     environment = os.environ | {"ATEN_CPU_CAPABILITY": tier}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert_close([np.load(tmp_path / "found.npy")], by_model(model, frame))
-    expected = by_model(optimize(small, torch.int8), frame[:70, :80])
+    with packed.own_alone():
+        expected = by_model(optimize(small, torch.int8), frame[:70, :80])
     assert_close([np.load(tmp_path / "quantized.npy")], expected, 0.05)

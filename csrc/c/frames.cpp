@@ -81,6 +81,7 @@ DARSWIN_API void darswin_free(darswin_network* network) { delete network; }
 DARSWIN_API int darswin_frame_size(const darswin_network* network, int64_t size[3]) {
   return caught(
       [&] {
+        require(size != nullptr, "size must not be NULL");
         size[0] = given(network).height();
         size[1] = network->width(), size[2] = network->channels();
         return 0;

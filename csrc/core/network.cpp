@@ -15,6 +15,8 @@ namespace {
 
 // The count of arguments of each opcode, in its order.
 constexpr std::array<int64_t, 12> kArguments = {9, 5, 23, 19, 2, 4, 1, 8, 7, 8, 8, 2};
+constexpr char kTooLarge[] = "wants more memory than its inputs and layers can need";
+
 void require(bool condition, const char* what) {
   if (!condition) throw std::invalid_argument(std::string("the program of a network ") + what);
 }
@@ -85,6 +87,29 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
     }
     steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at]));
     reader.at += arguments;
+  }
+  check_memory();
+}
+
+// Throws if a run would take far more memory than such inputs and such layers can need. Maps have
+// as many tokens as an input has numbers, or fewer, and tokens are as wide as a layer. The sizes of
+// buffers are only claims, and a small file must not claim all memory of a machine.
+void Network::check_memory() const {
+  int64_t tokens = 1, width = 1, most = 0, wanted = 0;
+  for (const int64_t numbers : inputs) tokens = std::max(tokens, numbers);
+  for (const Step& step : steps) {
+    for (const Layer* layer : {&step.layer, &step.block.qkv, &step.block.fc1}) {
+      width = std::max(width, layer->columns);
+    }
+  }
+  if (__builtin_mul_overflow(tokens, width, &most)) most = kMostNumbers;
+  most = std::clamp(most, kFreeNumbers, kMostNumbers);
+  for (const int64_t numbers : buffers) require((wanted += numbers) <= most, kTooLarge);
+  for (const Step& step : steps) {
+    if (step.opcode != Opcode::block) continue;
+    const WindowAttentionArgs<float>& map = step.block.windows;
+    const int64_t widest = std::max(step.block.qkv.columns, step.block.fc1.columns);
+    require(product({map.rings, map.sectors, widest}) <= most, kTooLarge);
   }
 }
 

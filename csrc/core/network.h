@@ -36,6 +36,9 @@ enum class Opcode : int64_t {
 
 constexpr int64_t kCopyAxes = 5;
 constexpr int64_t kMostNumbers = int64_t{1} << 40;  // of a program, and of the buffers of a run
+// A program may always have buffers of so many numbers for an image, 64 MB. More than that must
+// follow from its inputs and its layers.
+constexpr int64_t kFreeNumbers = int64_t{1} << 24;
 
 // The numbers of an input: (rows, numbers of one image) with a row for each image or one for all.
 struct Input {
@@ -78,6 +81,7 @@ class Network {
   Norm norm_at(int64_t offset, int64_t dim) const;
   Block block_of(const int64_t* arguments) const;
   void fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const;
+  void check_memory() const;
 
   std::vector<int64_t> program;
   const uint32_t* weights;

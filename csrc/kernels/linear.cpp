@@ -175,8 +175,9 @@ struct Panel {
     if constexpr (is_same_v<X, float>) {
       return sum + load<Floats>(bias);
     } else {
-      sum += load_bits<Sums>(bias + 2 * padded);
-      // In the order of oneDNN's products, so that the bits are the same.
+      // Unsigned: the parameters of a file may be any, and an int must not overflow.
+      using Words = Vector<uint32_t, kL>;
+      sum = (Sums)((Words)sum + load_bits<Words>(bias + 2 * padded));
       const Floats scaled = __builtin_convertvector(sum, Floats) * a.scale;
       return unfused(scaled * load<Floats>(bias + padded)) + load<Floats>(bias);
     }

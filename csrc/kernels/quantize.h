@@ -15,8 +15,8 @@ class Quantize {
  public:
   explicit Quantize(Quantizer q)
       : steps(q.steps),
-        lowest(static_cast<float>(-q.zero_point)),
-        highest(static_cast<float>(255 - q.zero_point)),
+        lowest(-static_cast<float>(q.zero_point)),
+        highest(255 - static_cast<float>(q.zero_point)),
         zero_point(static_cast<uint32_t>(q.zero_point)) {}
 
   template <typename V>

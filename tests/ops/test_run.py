@@ -87,6 +87,18 @@ def test_wrong_programs_are_refused_or_run(name):
     assert refused > 200  # most words matter
 
 
+BLOCK = (1, 2**10, 2**10, 1, 1, 4096, *[0] * 10, 1, 1, 0, 0, 0, 0, 0)  # 2**20 tokens, MLP of 4096
+
+
+@pytest.mark.parametrize(
+    "words", [(1, 48, 1, 2**30, 0), (1, 48, 2, 2**23, 2**24, 0), (1, 1, 1, 2**20, 0, 2, 23, *BLOCK)]
+)
+def test_a_small_program_cannot_ask_for_all_memory(words):
+    weights = torch.zeros(2**17, dtype=torch.int32)
+    with pytest.raises((RuntimeError, ValueError), match="more memory than its inputs"):
+        _run([torch.zeros(1, words[1])], weights, words)
+
+
 def test_wrong_inputs_are_refused():
     inputs, weights, words, _ = given()
     x, *tables = inputs
