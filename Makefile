@@ -1,35 +1,52 @@
 # Every target prepares its requirements: a virtual environment in .venv with pinned packages, and
 # the compiled module beside the Python sources.
 PYTHON ?= python3
+# Quoted for the shell: the path may have spaces.
+ROOT := "$(CURDIR)"
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-numerics test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): requirements.txt pyproject.toml setup.py
 	@echo "1/3 creating the environment $(VENV)"
-	@$(PYTHON) -m venv $(VENV)
+	@"$(PYTHON)" -m venv $(VENV)
 	@echo "2/3 installing the packages of requirements.txt, among them torch: a few minutes"
 	@$(BIN)/pip install -q -r requirements.txt
 	@echo "3/3 compiling and installing darswin: a few minutes"
-	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
+	@PATH=$(ROOT)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
 	@touch $@
 
 build: $(STAMP)  ## (re)build the compiled modules in place
-	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
+	@PATH=$(ROOT)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
 demo: build  ## train on nearly undistorted digits, test through fisheye lenses, draw a figure (2 minutes)
 	$(BIN)/python examples/digits.py
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
-PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
+PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
 test: build  ## run the fast tests: values, gradients, errors
 	$(PYTEST) -m "not slow"
+
+# What other CPUs would compute, as far as this one can: `make test-numerics NUMERICS=scalar` is one
+# of the settings, and `rounding` is a slower one (see tests/rounding.py). Their order is random, and the folder of temporary files has a space. A test that
+# fails here compares bits with another library, stands on a tie, or needs another test.
+NUMERICS := avx2 scalar vnni
+avx2 := ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 MKL_CBWR=COMPATIBLE
+scalar := ATEN_CPU_CAPABILITY=default ONEDNN_MAX_CPU_ISA=AVX512_CORE
+vnni := ONEDNN_MAX_CPU_ISA=AVX512_CORE_VNNI MKL_CBWR=AVX2
+rounding := DARSWIN_TEST_ROUNDING=1
+SEED := $(shell date +%s)
+
+test-numerics: $(NUMERICS:%=test-numerics-%)  ## run the fast tests in a random order as other CPUs round; NUMERICS=avx2 is one setting
+test-numerics-%: build
+	mkdir -p "build/tests of $*"
+	$($*) TMPDIR=$(ROOT)/build/tests\ of\ $* DARSWIN_TEST_SEED=$(SEED) $(PYTEST) -q -m "not slow"
 
 test-all: build  ## run all tests, also those that compile graphs, start processes, train or run the docs
 	$(PYTEST)
@@ -38,13 +55,13 @@ test-all: build  ## run all tests, also those that compile graphs, start process
 LOWEST := .venv-lowest
 
 $(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
-	$(PYTHON) -m venv --clear $(LOWEST)
+	"$(PYTHON)" -m venv --clear $(LOWEST)
 	$(LOWEST)/bin/python tests/lowest.py > $(LOWEST)/requirements.txt
 	$(LOWEST)/bin/pip install -q --only-binary :all: -r $(LOWEST)/requirements.txt
 	@touch $@
 
 test-lowest: build $(LOWEST)/installed  ## test the commands, files, pictures and ONNX with the oldest supported libraries
-	PYTHONPATH=$(CURDIR) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
+	PYTHONPATH=$(ROOT) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
 	  tests/cli tests/viz \
 	  tests/deploy/test_export.py -k "not program and not package"
 
@@ -63,15 +80,15 @@ PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=
 
 test-asan: build  ## test the operators on every tier with AddressSanitizer and UBSan
 	@rm -rf $(SANITIZED)/darswin
-	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined DARSWIN_BUILD=cmake-sanitized \
+	@PATH=$(ROOT)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined DARSWIN_BUILD=cmake-sanitized \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
 	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
 	cd $(SANITIZED); for tier in $$tiers; do \
 	  echo "== $$tier, sanitized"; \
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
-	      -m "not unsanitized" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py; \
+	    $(PYTEST) -q -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
+	      -m "not unsanitized" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py; \
 	done
 
 # The modules of another compiler, in the same way. Needs `apt-get install clang-16`.
@@ -83,10 +100,10 @@ test-tsan: build  ## test the pool of threads with ThreadSanitizer, calls of sev
 
 test-clang: build  ## test the operators and frames as clang compiles them; CLANG_CXX=clang++-16 is the compiler
 	@rm -rf $(CLANG)/darswin
-	@PATH=$(CURDIR)/$(BIN):$$PATH CXX=$(CLANG_CXX) DARSWIN_BUILD=cmake-clang \
+	@PATH=$(ROOT)/$(BIN):$$PATH CXX=$(CLANG_CXX) DARSWIN_BUILD=cmake-clang \
 	  $(BIN)/python setup.py -q build --build-lib $(CLANG)
-	@cd $(CLANG); DARSWIN_BUILD=cmake-clang $(PYTEST) -q -c $(CURDIR)/pyproject.toml \
-	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py $(CURDIR)/tests/test_build.py
+	@cd $(CLANG); DARSWIN_BUILD=cmake-clang $(PYTEST) -q -c $(ROOT)/pyproject.toml \
+	  --rootdir $(ROOT) -m "not slow" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/test_build.py
 
 fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
@@ -94,9 +111,6 @@ fuzz: build  ## call the operators with random and hostile arguments, and read 1
 
 kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py
-
-mutants: build  ## change single places of the code and count the changes that tests notice (hours; can be interrupted)
-	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python tests/mutants.py
 
 lint: $(STAMP)  ## check the code with ruff, mypy and clang-format
 	$(BIN)/ruff check .
@@ -144,7 +158,7 @@ study-pretrained: build  ## study detectors for ordinary photographs on fisheye 
 CONTRIB := .venv-contrib
 
 $(CONTRIB)/installed:
-	$(PYTHON) -m venv --clear $(CONTRIB)
+	"$(PYTHON)" -m venv --clear $(CONTRIB)
 	$(CONTRIB)/bin/pip install -q opencv-contrib-python-headless==$$(sed -n "s/^opencv-python-headless==//p" requirements.txt)
 	@touch $@
 
@@ -163,9 +177,9 @@ docs: build  ## build the site of docs/ in build/docs; warnings are errors
 sdist: $(STAMP)  ## build the sdist in dist/, and test it in a fresh environment
 	rm -f dist/darswin-*.tar.gz
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
-	$(PYTHON) -m venv --clear $(SCRATCH)
+	"$(PYTHON)" -m venv --clear $(SCRATCH)
 	$(SCRATCH)/bin/pip install -q $$(grep -E '^(cmake|hypothesis|ninja|pybind11|pytest|setuptools|torch)==' requirements.txt)
-	PATH=$(CURDIR)/$(SCRATCH)/bin:$$PATH $(SCRATCH)/bin/pip install -q --no-build-isolation dist/darswin-*.tar.gz
+	PATH=$(ROOT)/$(SCRATCH)/bin:$$PATH $(SCRATCH)/bin/pip install -q --no-build-isolation dist/darswin-*.tar.gz
 	$(SCRATCH)/bin/python tests/installed.py
 
 # One wheel of a platform serves every Python; darswin.frames works with those that are found here.
@@ -174,9 +188,9 @@ sdist: $(STAMP)  ## build the sdist in dist/, and test it in a fresh environment
 PYTHONS = $(foreach minor,11 12 13 14,$(shell python3.$(minor) -c 'import sys; print(sys.executable)' 2>/dev/null))
 wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a fresh environment
 	rm -rf build/wheel
-	PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_PYTHONS="$(PYTHONS)" \
+	PATH=$(ROOT)/$(BIN):$$PATH DARSWIN_PYTHONS="$(PYTHONS)" \
 	  $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
-	PATH=$(CURDIR)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
+	PATH=$(ROOT)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
 	$(MAKE) test-torch
 
 DEST := dist
@@ -190,7 +204,7 @@ pure-wheel: $(STAMP)  ## build the wheel for any system in dist/, which has no c
 	rm -rf build/lib $(PURE)
 	DARSWIN_PURE=1 $(BIN)/python -m build --no-isolation --wheel --outdir dist
 	$(BIN)/pip install -q --no-deps --target $(PURE) dist/darswin-*-py3-none-any.whl
-	PYTHONPATH=$(CURDIR)/$(PURE) $(BIN)/python tests/installed.py
+	PYTHONPATH=$(ROOT)/$(PURE) $(BIN)/python tests/installed.py
 
 published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel: on Linux in the manylinux_2_28 container, which needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
@@ -202,7 +216,7 @@ SCRATCH := build/scratch
 test-torch:  ## test the wheel with TORCH="2.10.0 2.11.0 …" on PYTHON; downloads gigabytes for each version
 	@set -e; for version in $(TORCH); do \
 	  echo "== torch $$version on $(PYTHON)"; \
-	  $(PYTHON) -m venv --clear $(SCRATCH); \
+	  "$(PYTHON)" -m venv --clear $(SCRATCH); \
 	  $(SCRATCH)/bin/pip install -q torch==$$version dist/darswin-*-manylinux_2_28_$$(uname -m).whl \
 	    $$(grep -E '^(hypothesis|pytest)==' requirements.txt); \
 	  $(SCRATCH)/bin/python tests/installed.py; \
@@ -211,9 +225,9 @@ test-torch:  ## test the wheel with TORCH="2.10.0 2.11.0 …" on PYTHON; downloa
 # Debian's Python for aarch64, and torch with the other packages of the tests. An emulated pip
 # installs them. Later wheels of torch for aarch64 need CUDA's libraries.
 AARCH64 := build/aarch64
-AARCH64_PYTHON = $(CURDIR)/$(AARCH64)/root/usr/include/python3.11
-EMULATED = PYTHONPATH=$(CURDIR)/$(AARCH64):$(CURDIR)/$(AARCH64)/site qemu-aarch64 -cpu max \
-  -L $(CURDIR)/$(AARCH64)/root $(CURDIR)/$(AARCH64)/root/usr/bin/python3
+AARCH64_PYTHON = $(ROOT)/$(AARCH64)/root/usr/include/python3.11
+EMULATED = PYTHONPATH=$(ROOT)/$(AARCH64):$(ROOT)/$(AARCH64)/site qemu-aarch64 -cpu max \
+  -L $(ROOT)/$(AARCH64)/root $(ROOT)/$(AARCH64)/root/usr/bin/python3
 
 $(AARCH64)/installed: requirements.txt
 	rm -rf $(AARCH64)
@@ -229,19 +243,19 @@ $(AARCH64)/installed: requirements.txt
 # Needs `apt-get install g++-aarch64-linux-gnu mmdebstrap qemu-user`, and outside Debian also
 # debian-archive-keyring.
 aarch64: $(STAMP) $(AARCH64)/installed  ## cross-compile for ARM (aarch64); the Makefile lists the packages it needs
-	PATH=$(CURDIR)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
+	PATH=$(ROOT)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
 	  -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
-	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR=$(CURDIR)/$(AARCH64)/site/torch \
+	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR=$(ROOT)/$(AARCH64)/site/torch \
 	  -DPYBIND11_DIR=$$(python -c 'import pybind11; print(pybind11.get_include())') \
 	  -DDARSWIN_PYTHONS=.cpython-311-aarch64-linux-gnu.so:$(AARCH64_PYTHON) \
-	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/cmake-aarch64/modules && cmake --build build/cmake-aarch64
+	  -DDARSWIN_OUTPUT_DIR=$(ROOT)/build/cmake-aarch64/modules && cmake --build build/cmake-aarch64
 	rm -rf $(AARCH64)/darswin
 	cp -r darswin $(AARCH64)
 	cp build/cmake-aarch64/modules/*.so $(AARCH64)/darswin
 
 test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
-	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(CURDIR)/pyproject.toml \
-	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frame*.py
+	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(ROOT)/pyproject.toml \
+	  --rootdir $(ROOT) -m "not slow" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py
 
 clean:  ## remove all build results
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/frames/*.so

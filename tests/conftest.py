@@ -1,4 +1,5 @@
 import os
+import random
 import sys
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import pytest
 import torch
 
 from darswin.ops import _module, cpu_capability
+
+ORDER = os.environ.get("DARSWIN_TEST_SEED")
 
 # For the tests of these programs.
 sys.path += [str(Path(__file__).parents[1] / name) for name in ("studies", "benchmarks")]
@@ -22,8 +25,16 @@ def pytest_report_header(config):
     return (
         f"darswin: tier {cpu_capability()} of {_module.tiers()}, ATEN_CPU_CAPABILITY="
         f"{os.environ.get('ATEN_CPU_CAPABILITY', '')!r}, torch {torch.__version__}, "
-        f"{torch.get_num_threads()} threads"
+        f"{torch.get_num_threads()} threads, DARSWIN_TEST_SEED={ORDER or ''}"
     )
+
+
+def pytest_collection_modifyitems(items):
+    """With DARSWIN_TEST_SEED, a random order: of the files, and of the tests in each."""
+    if ORDER:
+        chance = random.Random(ORDER)
+        of_file = {item.path: chance.random() for item in items}
+        items.sort(key=lambda item: (of_file[item.path], chance.random()))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -44,3 +55,15 @@ def threads():
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def other_rounding():
+    """With DARSWIN_TEST_ROUNDING, torch rounds as no CPU does: see rounding.py."""
+    if "DARSWIN_TEST_ROUNDING" not in os.environ:
+        yield
+        return
+    from rounding import Rounded
+
+    with Rounded():
+        yield
