@@ -12,7 +12,7 @@ def test_a_record_and_its_plot(record, tmp_path, capsys):
     record.publish(tmp_path / "new", "model", draw)
     path = tmp_path / "new" / "model--amd-epyc-25-17-avx512.json"
     assert Record.load(path) == record
-    assert capsys.readouterr().out.split() == [str(path), str(path.with_suffix(".png"))]
+    assert capsys.readouterr().out.splitlines() == [str(path), str(path.with_suffix(".png"))]
 
 
 def test_a_plot_needs_matplotlib(record, tmp_path, capsys):

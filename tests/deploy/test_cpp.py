@@ -42,7 +42,7 @@ def libraries_of(program: Path) -> str:
     """What the dynamic linker loads, without its folders."""
     shown = subprocess.run(["ldd", program], capture_output=True, text=True, check=True).stdout
     assert "not found" not in shown
-    return re.sub(r"=> \S+", "", shown)
+    return re.sub(r"=> .*(?= \()", "", shown)
 
 
 def result(folder: Path, *arguments) -> str:
