@@ -93,7 +93,7 @@ def test_rays_of_pixels_come_back_to_them(name, data):
 def test_points_go_through_every_lens_and_come_back(name, model):
     lens, size = every_lens()[model]
     view = make_view(name, size if name == "none" else (200, 200))
-    places = np.random.default_rng(0).uniform(0, 1, (300, 2)) * size[::-1] - 0.5
+    places = np.random.default_rng(0).uniform(0, 1, (1000, 2)) * size[::-1] - 0.5
     shares = []
     for tile in range(view.count):
         of_tile = dict(tile=tile) if view.count > 1 else {}
@@ -102,7 +102,7 @@ def test_points_go_through_every_lens_and_come_back(name, model):
         shares.append(seen.mean())
         again = view.to_image(points[seen], lens, size, **of_tile)
         np.testing.assert_allclose(again, places[seen], rtol=0, atol=2e-4)
-    assert max(shares) > 0.05
+    assert max(shares) > 0.01
     beyond = view.to_view(np.array([[-2.0, 5.0], [5.0, size[0] + 1.0]]), lens, size, **of_tile)
     assert np.isnan(view.to_image(beyond, lens, size, **of_tile)).any(-1).all()
 
