@@ -172,11 +172,10 @@ class _Views:
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
         self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
-        camera = None
+        camera: Lens | None = None
         if self._look.view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
-            camera = Perspective.from_fov(fov, width / 2, image_size=(height, width))
-            camera = to_corners(camera)
+            camera = to_corners(Perspective.from_fov(fov, width / 2, image_size=(height, width)))
         return _Viewed(Sampler(plan(view, exact, size, output="uint8")), lens, camera)
 
 
