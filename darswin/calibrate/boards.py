@@ -121,7 +121,7 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
     parameters = cv2.aruco.DetectorParameters()
-    found: dict[str, list[float]] = {}
+    found: dict[str, list[int]] = {}
     for name in (name for name in _names() if "H" not in name):  # 36H11 is another name of 36h11
         # Kalibr draws the tags of its only set with a border of two bits.
         for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
