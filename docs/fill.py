@@ -27,26 +27,18 @@ PAGES = [
 
 # The CPUs that there are records of, by the end of their names; the pages show the first one.
 CPUS = {"amd-epyc-25-1-avx2": "AMD EPYC (Zen 3)"}
-SUITES = ("sampling", "to_image", "attention", "model", "one_frame", "frames")
+SUITES = ("sampling", "to_image", "attention", "one_frame", "frames")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 FRAME_PEERS = ("eager model", "ONNX Runtime", "OpenVINO", "AOTInductor package")
 IMAGE_PEERS = ("F.pad + F.grid_sample",)
-# The rows of the tables of speed, the README's first: subject, mode, setting, batch.
-README_SPEED = (
+# The rows of the README's table of speed: subject, mode, setting, batch.
+SPEED = (
     ("polar_sample", "forward", "256×256", 8),
     ("polar_sample", "forward+backward", "256×256", 8),
     ("polar_to_image", "forward", "64×256 → 256×256", 2),
-    ("darswin_a_small", "inference, float32", "64×64", 8),
-    ("darswin_a_small", "inference, int8", "64×64", 8),
-    ("darswin_a_small", "training, float32", "64×64", 8),
-)
-SPEED = (
-    *README_SPEED,
     ("window_attention", "forward", "A stage 1", 32),
     ("window_attention", "forward+backward", "A stage 1", 32),
-    ("darswin_a_small", "inference, float32", "64×64", 1),
-    ("darswin_a_small", "inference, bfloat16", "64×64", 8),
 )
 
 
@@ -86,15 +78,6 @@ def missed_line(timings: Sequence[Timing]) -> str:
     )
 
 
-def loader_line(rates: Mapping[str, float]) -> str:
-    one, two = (f"{rates[f'{n} worker processes']:.0f}" for n in (1, 2))
-    return (
-        f"One core prepares {rates['all']:.0f} such images per second.\n"
-        f"One worker process beside the training prepares {one} images per second, and two prepare "
-        f"{two}."
-    )
-
-
 def drop_in_line(timings: Sequence[Timing]) -> str:
     """How much faster the call of howto/use.md is than what it replaces."""
     found = [
@@ -125,8 +108,8 @@ def frame_line(timings: Sequence[Timing]) -> str:
     return (
         f"For one frame on one core, {how}, these models are {first}.\n"
         f"They are {' and '.join(others)}.\n"
-        f"In a loop, {' and '.join(wide)} as fast in int8 as in float32.\n"
-        f"On the tier of AVX2, {' and '.join(narrow)} as fast."
+        f"In a loop, {' and '.join(wide)} as fast in int8 as in float32."
+        + (f"\nOn the tier of AVX2, {' and '.join(narrow)} as fast." if narrow else "")
     )
 
 
@@ -138,11 +121,6 @@ def frames_table(timings: Sequence[Timing]) -> str:
         ours = " / ".join(f"{1e6 * t.median:.3g}" for t in found[OURS])
         rows.append([setting, ours, *(bench.ratios(found[peer]) for peer in peers)])
     return bench.markdown(["frame → samples", "ours (µs)", *peers], rows)
-
-
-def if_measured(table: str) -> str:
-    """A table, or that it is empty because the record is older than it."""
-    return table if table.count("\n") > 1 else "The record is older than this measurement."
 
 
 def demo_table(record: dict) -> str:
@@ -179,14 +157,13 @@ def tables() -> dict[str, str]:
     studies = ROOT / "studies" / "results"
     suites = {suite: records(suite) for suite in SUITES}
     first = {suite: next(iter(found.values())) for suite, found in suites.items()}
-    sampling, to_image, attention, model, one_frame, frames = first.values()
+    sampling, to_image, attention, one_frame, frames = first.values()
     cpus = {
         cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
         for cpu in CPUS.values()
     }
     single = peers.single_frames(one_frame.timings)
     demo = json.loads((ROOT / "docs" / "accuracy.json").read_text())
-    training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
     quantized = json.loads((studies / "int8.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
@@ -201,31 +178,23 @@ def tables() -> dict[str, str]:
         "demo line": demo_line(demo),
         "drop-in": drop_in_line(sampling.timings),
         "machine line": machine_line(first),
-        "speed": peers.best_table(cpus, README_SPEED),
-        "cpus": peers.best_table(cpus, SPEED),
+        "speed": peers.best_table(cpus, SPEED),
         "missed line": missed_line([*sampling.timings, *to_image.timings, *attention.timings]),
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
-        "model": bench.models_table(model.timings),
         "frame line": frame_line(one_frame.timings),
         "latency": peers.latency_table(one_frame.timings, FRAME_PEERS[1:]),
         "camera": peers.camera_table(one_frame.timings, FRAME_PEERS[1:2]),
-        "paced": if_measured(bench.paced_table(single)),
-        "from frame": if_measured(
-            bench.paced_table(t for t in one_frame.timings if t not in single)
-        ),
-        "starts": if_measured(bench.starts_table(one_frame.starts)),
-        "frames paced": if_measured(bench.paced_table(frames.timings)),
+        "paced": bench.paced_table(single),
+        "from frame": bench.paced_table(t for t in one_frame.timings if t not in single),
+        "starts": bench.starts_table(one_frame.starts),
+        "frames paced": bench.paced_table(frames.timings),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),
-        "model int8": bench.quantized_table(model.timings),
-        "model memory": bench.memory_table(model.memory),
         "sampling": peers.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
         "to image": peers.peers_table(
             to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)
         ),
         "attention": peers.attention_table(attention.timings),
-        "training": peers.training_table(training["models"]),
-        "loader line": loader_line(training["loader"]),
         **study.tables(cells),
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),

@@ -134,9 +134,9 @@ def test_a_file_is_no_run(capsys, tmp_path, command):
         said = error(capsys, command, "--run", file)
         assert "--run names the folder in which `darswin fit` keeps" in said
         assert (use in said) == (command != "quantize")  # which has neither option
-        assert f"{file} is a file. " in said
+        assert f"{file} is a file" in said
     (tmp_path / "config.yaml").touch()
-    assert f"belongs to the run {tmp_path}. " in error(capsys, command, "--run", file)
+    assert f"belongs to the run {tmp_path}" in error(capsys, command, "--run", file)
 
 
 def test_flags_of_parameters():
