@@ -27,7 +27,7 @@ PAGES = [
 
 # The CPUs that there are records of, by the end of their names; the pages show the first one.
 CPUS = {"amd-epyc-25-1-avx2": "AMD EPYC (Zen 3)"}
-SUITES = ("sampling", "to_image", "attention", "one_frame", "frames")
+SUITES = ("sampling", "to_image", "one_frame", "frames")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 FRAME_PEERS = ("eager model", "ONNX Runtime", "OpenVINO", "AOTInductor package")
@@ -37,8 +37,6 @@ SPEED = (
     ("polar_sample", "forward", "256×256", 8),
     ("polar_sample", "forward+backward", "256×256", 8),
     ("polar_to_image", "forward", "64×256 → 256×256", 2),
-    ("window_attention", "forward", "A stage 1", 32),
-    ("window_attention", "forward+backward", "A stage 1", 32),
 )
 
 
@@ -157,7 +155,7 @@ def tables() -> dict[str, str]:
     studies = ROOT / "studies" / "results"
     suites = {suite: records(suite) for suite in SUITES}
     first = {suite: next(iter(found.values())) for suite, found in suites.items()}
-    sampling, to_image, attention, one_frame, frames = first.values()
+    sampling, to_image, one_frame, frames = first.values()
     cpus = {
         cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
         for cpu in CPUS.values()
@@ -179,8 +177,8 @@ def tables() -> dict[str, str]:
         "drop-in": drop_in_line(sampling.timings),
         "machine line": machine_line(first),
         "speed": peers.best_table(cpus, SPEED),
-        "missed line": missed_line([*sampling.timings, *to_image.timings, *attention.timings]),
-        "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
+        "missed line": missed_line([*sampling.timings, *to_image.timings]),
+        "missed": peers.missed_table([*sampling.timings, *to_image.timings]),
         "frame line": frame_line(one_frame.timings),
         "latency": peers.latency_table(one_frame.timings, FRAME_PEERS[1:]),
         "camera": peers.camera_table(one_frame.timings, FRAME_PEERS[1:2]),
@@ -194,7 +192,6 @@ def tables() -> dict[str, str]:
         "to image": peers.peers_table(
             to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)
         ),
-        "attention": peers.attention_table(attention.timings),
         **study.tables(cells),
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),
