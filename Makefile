@@ -34,8 +34,9 @@ test: build  ## run the fast tests: values, gradients, errors
 	$(PYTEST) -m "not slow"
 
 # What other CPUs would compute, as far as this one can: `make test-numerics NUMERICS=scalar` is one
-# of the settings, and `rounding` is a slower one (see tests/rounding.py). Their order is random, and the folder of temporary files has a space. A test that
-# fails here compares bits with another library, stands on a tie, or needs another test.
+# of the settings, and `rounding` is a slower one (see tests/rounding.py). The order of the tests is
+# random, and the folder of temporary files has a space. A test that fails here compares bits with
+# another library, stands on a tie, or needs another test.
 NUMERICS := avx2 scalar vnni
 avx2 := ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 MKL_CBWR=COMPATIBLE
 scalar := ATEN_CPU_CAPABILITY=default ONEDNN_MAX_CPU_ISA=AVX512_CORE

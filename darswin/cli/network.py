@@ -294,12 +294,12 @@ class NetworkAnswers(Answers):
         self, name: str, image: np.ndarray, labels: np.ndarray, colors: Sequence[Any]
     ) -> dict[str, Any]:
         """Writes ids (H, W) as a PNG, and on the picture."""
-        counts = np.bincount(labels.ravel(), minlength=IGNORE + 1)[:IGNORE]
         replace_file(self._out / f"labels/{name}.png", label_png(labels, colors))
         laid = overlay(image, label_image(labels, colors), where=labels != IGNORE)
         answer: dict[str, Any] = {"labels": f"labels/{name}.png"}
         answer["overlay"] = write_overlay(self._out, name, laid)
         if self.labels is not None:
+            counts = np.bincount(labels.ravel(), minlength=IGNORE + 1)[:IGNORE]
             shares = (counts / max(1, counts.sum())).round(6).tolist()
             answer["shares"] = {str(self._name(k)): s for k, s in enumerate(shares) if counts[k]}
         return answer

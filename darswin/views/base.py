@@ -2,9 +2,8 @@
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,7 +20,6 @@ from darswin.ops.reference import normalized
 
 Pair = tuple[int, int]
 PerChannel = float | Sequence[float]
-Points = TypeVar("Points", np.ndarray, Tensor)
 
 
 class PolarGrid(NamedTuple):

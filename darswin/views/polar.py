@@ -173,7 +173,9 @@ class PolarView(View):
         if self.in_pixels:
             maps = resized_around(maps, self.map_size).permute(0, 2, 3, 1)
         if not maps.is_floating_point():
-            places = places_of(maps).permute(*((0, 3, 1, 2) if self.in_pixels else (0, 1, 2, 3)))
+            places = places_of(maps)
+            if self.in_pixels:
+                places = places.permute(0, 3, 1, 2)
             return nearest(maps, self.back(places, prepared), prepared)
         dtype = torch.float64 if maps.dtype == torch.float64 else torch.float32
         radii, r_max, center, affine, points = (
