@@ -96,7 +96,7 @@ class Hostile:
 def test_a_hostile_checkpoint_is_refused(entry, zipped, tmp_path):
     source, target, executed = (tmp_path / name for name in ("a.pth", "a.safetensors", "executed"))
     for function, name, *arguments in (
-        (os.system, "posix.system", f"touch {executed}"),
+        (os.system, "posix.system", f"touch '{executed}'"),
         (shutil.copyfile, "shutil.copyfile", __file__, str(executed)),
         (eval, "eval", f"open({str(executed)!r}, 'w')"),
     ):
