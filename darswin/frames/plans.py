@@ -74,6 +74,16 @@ class Plan:
         if len(self.mean) != len(self.std):
             raise ValueError(f"a plan needs as many means as stds, got {self.mean} and {self.std}")
 
+    @classmethod
+    def of_points(
+        cls, points: np.ndarray, size: tuple[int, int], *, output: Output = "image",
+        mean: tuple[float, ...] = (0.0,), std: tuple[float, ...] = (1.0,), tiles: int = 1,
+        reads: int = 1,
+    ) -> "Plan":  # fmt: skip
+        """The plan of single points."""
+        arrays = _at_pixels(points, size, output, tiles, reads)
+        return cls(**arrays, size=size, output=output, mean=mean, std=std, reads=reads)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
             return NotImplemented

@@ -47,7 +47,7 @@ def reading(sample: nn.Module, lens: Lens | None, size: Pair, *, exact: bool = T
     if isinstance(view, PolarView):
         return Reading(points, view.layout, view.samples, channels, view.mean, view.std)
     assert isinstance(points, Tensor)
-    reads = view.reads_of(size) if isinstance(view, PixelView) else 1
+    reads = points.shape[2] // view.size[1] if isinstance(view, PixelView) and view.size else 1
     return Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)
 
 
