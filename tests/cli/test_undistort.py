@@ -19,7 +19,6 @@ from darswin.data.cameras import Calibrations
 from darswin.lens import Equidistant, to_dict
 from darswin.utils.video import read_frames
 from darswin.views import make_view
-from darswin.viz.views import undistort
 
 SIZE = (96, 128)  # of the calibration's pictures
 K = np.array([[52.0, 0.0, 62.0], [0.0, 51.0, 49.5], [0.0, 0.0, 1.0]])
@@ -152,7 +151,7 @@ def test_a_panorama_of_a_camera_that_looks_down(folder):
     out = run(folder, "--view=panorama", "--up=0,0,-1", "--size=40,100")
     lens = lenses.load(folder / "fisheye.yaml", coefficients="fisheye").with_theta_max(None)
     view = make_view("panorama", (40, 100), up=(0, 0, -1))
-    found, expected = read(out / "a.png"), undistort(picture(), lens, view)
+    found, expected = read(out / "a.png"), view.at(lens, picture().shape[:2])(picture())
     assert np.abs(found.astype(int) - expected).max() <= 3
     seen = (found.max(-1) > 0).mean(0)
     assert (seen > 0.4).all()  # in every direction around
