@@ -51,11 +51,12 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
     camera = lens.Perspective.from_fov(FOV, scans.shape[2] / 2)
     # The field of view fills the inscribed circle of the image for every ξ.
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, size / 2)
-    images = []
-    for k, scan in enumerate(scans):
-        remap = CameraView(lenses[k], (size, size), reads=1).at(camera, scan.shape)
-        points = remap.points.astype(np.float32)
-        images.append(cv2.remap(scan, points, None, cv2.INTER_CUBIC))
+    view = CameraView(lenses, (size, size), reads=1)
+    points = view.image_points(camera.to(torch.float64), scans.shape[1:])  # of all lenses at once
+    images = [
+        cv2.remap(scan, of_scan, None, cv2.INTER_CUBIC)
+        for scan, of_scan in zip(scans, points.float().numpy(), strict=True)
+    ]
     return torch.from_numpy(np.stack(images))[:, None], lenses
 
 
