@@ -69,6 +69,7 @@ class TilesView(PixelView):
     """
 
     size: Pair
+    tiles: Sequence[StereographicView]
 
     def __init__(
         self,
