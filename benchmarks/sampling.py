@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from kit.timing import OURS, Case, Timing, measure
 from peers import check, compare, forward, run_suite
 from torch import Tensor
 
 from darswin import polar_grid
-from darswin.bench.timing import OURS, Case, Timing, measure
 from darswin.lens import Spherical
 from darswin.ops import polar_sample
 

@@ -69,11 +69,6 @@ COMMANDS = {
         PICTURES,
         "darswin.cli.warp:warp",
     ),
-    "bench": Command(
-        "measures the speed of a model on this machine (15 minutes)",
-        (),
-        "darswin.cli.bench:bench",
-    ),
     "info": Command(
         "prints versions, CPU and extras, for bug reports", (), "darswin.cli.info:info"
     ),
