@@ -14,7 +14,7 @@ from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.pixels import PixelView
 from darswin.views.plain import PlainView
-from darswin.views.polar import PolarSample, PolarView, polar_grid
+from darswin.views.polar import PolarView
 from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
@@ -31,7 +31,6 @@ __all__ = [
     "PixelView",
     "PlainView",
     "PolarGrid",
-    "PolarSample",
     "PolarView",
     "Prepared",
     "RayView",
@@ -42,7 +41,6 @@ __all__ = [
     "View",
     "list_views",
     "make_view",
-    "polar_grid",
     "register_view",
     "turned",
     "up_of",

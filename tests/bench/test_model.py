@@ -57,10 +57,10 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (dict(size=0), "size must be from 1 to 65536, got 0"),
-        (dict(batches=[-1]), "batches must be from 1 to 65536, got -1"),
+        (dict(size=0), "`size` must be from 1 to 65536, got 0"),
+        (dict(batches=[-1]), "`batches` must be from 1 to 65536, got -1"),
         (dict(batches=[]), "--batches must have at least one number"),
-        (dict(seconds=float("nan")), "seconds must be above 0, got nan"),
+        (dict(seconds=float("nan")), "`seconds` must be above 0, got nan"),
         (dict(model="swan"), "unknown model 'swan'"),
     ],
 )
