@@ -9,7 +9,9 @@ import torch
 
 from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.layers.linear import onednn_lack
-from darswin.models import list_models, list_pretrained, read_card
+from darswin.models import list_models
+from darswin.models.registry import list_pretrained
+from darswin.models.saving import read_card
 from darswin.ops import _module, cpu_capability
 from darswin.utils import extras
 

@@ -56,7 +56,7 @@ COMMANDS = {
     "convert": Command(
         "converts a pickled checkpoint to safetensors, without executing it",
         (),
-        "darswin.compat:convert_checkpoint",
+        "darswin.compat.checkpoint:convert_checkpoint",
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(

@@ -1,32 +1,27 @@
 """Data: images seen through lenses."""
 
-from darswin.data.augment import Mixing, RandAugment, RandomErasing
+from darswin.data.augment import Mixing, RandAugment
 from darswin.data.cameras import Calibrations
-from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
+from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses
 from darswin.data.pictures import open_source
 from darswin.data.reframing import Moved, RandomTurns, Reframing, Turn, Warped, at_size, reframe
 from darswin.data.sample import Sample
-from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import IGNORE
-from darswin.data.splits import LeftOut
 from darswin.data.warping import FullSize, lens_at_size, warp_map
 from darswin.data.wide_angle import WideAngle
 
 __all__ = [
     "IGNORE",
     "LEVELS",
-    "Calibrated",
     "Calibrations",
     "FullSize",
-    "LeftOut",
     "Mixing",
     "Moved",
     "PolynomialLenses",
     "RandAugment",
-    "RandomErasing",
     "RandomTurns",
     "Reframing",
     "Sample",
@@ -40,7 +35,6 @@ __all__ = [
     "lens_at_size",
     "open_scenes",
     "open_source",
-    "parse_lenses",
     "reframe",
     "warp_map",
 ]

@@ -33,8 +33,6 @@ from darswin.layers.quantized import (
     quantized_layers,
 )
 
-__all__ = ["fastest_dtype"]
-
 Key = TypeVar("Key")
 Layer = Callable[[Tensor], Tensor]
 # The map of a stage, which may change, and the position biases of its blocks → the map.

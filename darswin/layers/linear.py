@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-__all__ = ["Linear"]
-
 MatmulBackend = Literal["torch", "onednn"]
 MATMUL_BACKENDS = get_args(MatmulBackend)
 

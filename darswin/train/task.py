@@ -33,8 +33,6 @@ from darswin.train.finetuning import (
 from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 
-__all__ = ["TaskModule"]
-
 Batch = tuple[Tensor, Lens, Tensor]
 
 

@@ -3,8 +3,6 @@
 import ctypes
 from collections.abc import Callable
 
-__all__ = ["keep_freed_memory"]
-
 # Constants of glibc's malloc.h.
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from darswin.cli import lens, predict, quantize
 from darswin.cli.arguments import run_command, with_lists
 from darswin.cli.main import main
-from darswin.compat import convert_checkpoint
+from darswin.compat.checkpoint import convert_checkpoint
 
 
 @pytest.mark.parametrize(
