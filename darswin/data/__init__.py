@@ -1,11 +1,12 @@
 """Data: images seen through lenses."""
 
-from darswin.data.augment import Mixing, RandAugment
+from darswin.data.augment import RandAugment
 from darswin.data.cameras import Calibrations
 from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses
 from darswin.data.pictures import open_source
 from darswin.data.reframing import Moved, RandomTurns, Reframing, Turn, Warped, at_size, reframe
 from darswin.data.sample import Sample
+from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
@@ -16,9 +17,9 @@ from darswin.data.wide_angle import WideAngle
 __all__ = [
     "IGNORE",
     "LEVELS",
+    "Calibrated",
     "Calibrations",
     "FullSize",
-    "Mixing",
     "Moved",
     "PolynomialLenses",
     "RandAugment",
