@@ -1,10 +1,10 @@
 """Data: images seen through lenses."""
 
 from darswin.data import labels
-from darswin.data.augment import Mixing, RandAugment, RandomErasing
+from darswin.data.augment import RandAugment
 from darswin.data.cameras import Calibrations
 from darswin.data.framing import FullSize, fitted
-from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
+from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses
 from darswin.data.pictures import open_source
 from darswin.data.sample import Sample
 from darswin.data.samples import Calibrated
@@ -12,7 +12,6 @@ from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import IGNORE
-from darswin.data.splits import LeftOut
 from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import WideAngle
 
@@ -22,11 +21,8 @@ __all__ = [
     "Calibrated",
     "Calibrations",
     "FullSize",
-    "LeftOut",
-    "Mixing",
     "PolynomialLenses",
     "RandAugment",
-    "RandomErasing",
     "RandomTurns",
     "Sample",
     "SceneSamples",
@@ -37,5 +33,4 @@ __all__ = [
     "labels",
     "open_scenes",
     "open_source",
-    "parse_lenses",
 ]

@@ -236,7 +236,7 @@ class Calibrated(Samples):
 
     Raises:
         ValueError: a picture without a lens, or with another aspect ratio than its calibration.
-        BrokenImageError: from `dataset[i]`, for a file that cannot be read.
+        OSError: from `dataset[i]`, for a file that cannot be read.
     """
 
     source: Source

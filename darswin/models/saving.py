@@ -106,7 +106,7 @@ def read_card(path: str | os.PathLike) -> ModelCard:
     """The card of a model file, read without the weights.
 
     Args:
-        path: the path of the file, or a name from `list_pretrained()`.
+        path: the path of the file, or the name of a trained model, which `darswin models` lists.
 
     Raises:
         NoCardError: the file has no card.
@@ -126,12 +126,11 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     """The model from a file, in eval mode, and its card.
 
     Args:
-        path: the path of the file, or a name from `list_pretrained()`.
+        path: the path of the file, or the name of a trained model, which `darswin models` lists.
 
     Raises:
-        NoCardError: the file has no card.
-        ValueError: the file is no safetensors file or is damaged, its card is wrong, or the weights
-            do not fit the model of the card.
+        ValueError: the file is no safetensors file or is damaged, it has no card or a wrong one, or
+            the weights do not fit the model of the card.
     """
     path = model_file(path)
     weights, metadata = read_tensors(path)
@@ -173,10 +172,11 @@ def _parsed(entry: str) -> ModelCard:
         values = json.loads(entry)
     except ValueError as error:
         raise ValueError(f"its model card is no JSON: {error}") from error
-    if type(values) is not dict or "model" not in values:
-        raise ValueError(f'its model card must be an object with a "model", got {short(values)}')
-    # Older files lack some fields.
-    known = {name: values[name] for name in _FIELDS if name in values}
+    if type(values) is not dict:
+        raise ValueError(f"its model card must be an object, got {short(values)}")
+    if missing := [name for name in _FIELDS if name not in values]:
+        raise ValueError(f"its model card lacks {', '.join(missing)}")
+    known = {name: values[name] for name in _FIELDS}
     for name, value in known.items():
         fits, expected = _FIELDS[name]
         if not fits(value):

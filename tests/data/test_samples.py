@@ -14,7 +14,6 @@ from torch.utils.data import DataLoader
 
 from darswin.data import (
     IGNORE,
-    Calibrated,
     Calibrations,
     RandAugment,
     RandomTurns,
@@ -26,7 +25,7 @@ from darswin.data import (
 )
 from darswin.data.order import TrainingOrder
 from darswin.data.pictures import Arrays
-from darswin.data.samples import Draw
+from darswin.data.samples import Calibrated, Draw
 from darswin.lens import Equidistant, Spherical, Tabulated, load
 from darswin.lens.orientation import in_upright_picture
 from darswin.utils.image import BrokenImageError, read_oriented
