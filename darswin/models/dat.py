@@ -10,11 +10,11 @@ from darswin.layers.attention import WindowAttention, check_heads
 from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
-from darswin.lens.spacing import Spacing
 from darswin.models.registry import register_model
 from darswin.models.stages import StageSizes
 from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
+from darswin.views import View
 from darswin.views.base import Pair, PerChannel
 
 
@@ -137,12 +137,9 @@ class DAT(Swin):
         blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
         groups: Sequence[int] = (1, 1, 3, 6),
         offset_range: float = 2.0,
-        view: str = "none",
-        max_fov: float | None = None,
-        spacing: Spacing | None = None,
-        theta_max: float | None = None,
-        mean: PerChannel = 0.0,
-        std: PerChannel = 1.0,
+        view: str | View = "none",
+        mean: PerChannel | None = None,
+        std: PerChannel | None = None,
     ):
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
@@ -155,8 +152,7 @@ class DAT(Swin):
         super().__init__(
             num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate, image_size=image_size, patch_size=patch_size,
-            window=window, view=view, max_fov=max_fov, spacing=spacing, theta_max=theta_max,
-            mean=mean, std=std,
+            window=window, view=view, mean=mean, std=std,
         )  # fmt: skip
 
     def downsample(self, dim: int, merge: Pair) -> nn.Module:

@@ -18,7 +18,6 @@ from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
-from darswin.views.tangent import TangentView
 from darswin.views.tiles import TilesView
 
 __all__ = [
@@ -37,7 +36,6 @@ __all__ = [
     "RayView",
     "SquareView",
     "StereographicView",
-    "TangentView",
     "TilesView",
     "View",
     "list_views",

@@ -64,7 +64,7 @@ class RayView(PixelView):
     size: Pair
     upright = False  # True if all columns are vertical in the world, and not only the middle one
     around = False  # True if a view shows all around the horizon, and not as much as the lens
-    reach = math.pi  # the largest angle from the middle that a view of a whole lens shows, rad
+    usual_fov = 2 * math.pi  # at most, of a view of a whole lens, rad
     widest = 2 * math.pi  # the largest fov
 
     def __init__(
@@ -219,7 +219,7 @@ class RayView(PixelView):
         # Upright views are as wide as the lens sees on the horizon, if it sees that at all.
         horizon = torch.zeros_like(start)
         row = torch.where(self._sees(lens, horizon[None], size)[..., None], horizon, start)[:, 0]
-        edge = row.new_tensor([self.half_width(self.reach), 0.0])
+        edge = row.new_tensor([self.half_width(self.usual_fov / 2), 0.0])
         begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
         ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
         goals = torch.stack(torch.broadcast_tensors(*ends), 1)
@@ -250,7 +250,7 @@ class RayView(PixelView):
     def _highest(self, start: Tensor, sign: int) -> Tensor:
         """The end of the column at `start`, (1, 2), upwards (-1) or downwards (1)."""
         if not self.upright:
-            return start.new_tensor([[0.0, sign * self.half_width(self.reach)]])
+            return start.new_tensor([[0.0, sign * self.half_width(self.usual_fov / 2)]])
         steepest = (0.0, sign * math.sin(_STEEPEST), math.cos(_STEEPEST))
         return self.to_plane(start.new_tensor([steepest]))
 
