@@ -51,8 +51,8 @@ class LensAdapter(Model[Any]):
         ValueError: the size is below 1, an argument is given beside a `View`, the output is
             unknown, or mean and std do not fit together; in forward, the number of detections does
             not fit.
-        TypeError: the size is no int and no pair of ints; in forward, images of uint8 without mean and std, or results of `boxes` that are
-            no detections.
+        TypeError: the size is no int and no pair of ints; in forward, images of uint8 without mean
+            and std, or results of `boxes` that are no detections.
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
     """

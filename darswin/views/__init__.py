@@ -7,9 +7,10 @@ from darswin.views.base import (
     View,
 )
 from darswin.views.cylindrical import CylindricalView
-from darswin.views.directions import RayView, turned, up_of
+from darswin.views.directions import RayView
 from darswin.views.equirectangular import EquirectangularView
 from darswin.views.mercator import MercatorView
+from darswin.views.orientation import turned, up_of
 from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.pixels import PixelView

@@ -8,7 +8,8 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel
-from darswin.views.directions import RayView, Vector
+from darswin.views.directions import RayView
+from darswin.views.orientation import Vector
 from darswin.views.registry import register_view
 
 

@@ -29,6 +29,18 @@ def list_views() -> list[str]:
     return sorted(_VIEWS)
 
 
+def flat_views() -> list[str]:
+    """The names of the views of one picture that people look at: they have a `usual_shape`."""
+    return [name for name in list_views() if hasattr(_VIEWS[name], "usual_shape")]
+
+
+def view_class(name: str) -> Any:
+    """The class with this name, or the function that makes the view; ValueError for others."""
+    if name not in _VIEWS:
+        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
+    return _VIEWS[name]
+
+
 def make_view(
     name: str,
     size: int | Pair | None,
@@ -50,9 +62,7 @@ def make_view(
         ValueError: the name is unknown, or an argument is out of range.
         TypeError: the view has no such option, or the size is no int and no pair of ints.
     """
-    if name not in _VIEWS:
-        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
-    make, options = _VIEWS[name], {k: value for k, value in options.items() if value is not None}
+    make, options = view_class(name), {k: value for k, value in options.items() if value is not None}
     given = options | dict(mean=mean, std=std)
     pair = None if size is None else side_or_pair("size", size)
     try:

@@ -66,6 +66,11 @@ class SquareView(PixelView):
         # Its edge is before π, where all directions are one.
         self.theta_max = None if fov is None else min(fov / 2, math.nextafter(math.pi, 0))
 
+    @classmethod
+    def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
+        """`RayView.usual_shape`, of all up to θ_max."""
+        return 2 * lens.theta_max.item() if fov is None else fov, 1.0
+
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 

@@ -18,14 +18,8 @@ from darswin.views.base import (
     check_count,
     check_seen_images,
 )
-from darswin.views.directions import (
-    AXIS,
-    PICTURE_TOP,
-    Vector,
-    check_sees,
-    frame_of,
-    unit_vector,
-)
+from darswin.views.directions import check_sees
+from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
 from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 from darswin.views.stereographic import StereographicView
