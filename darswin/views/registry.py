@@ -62,7 +62,8 @@ def make_view(
         ValueError: the name is unknown, or an argument is out of range.
         TypeError: the view has no such option, or the size is no int and no pair of ints.
     """
-    make, options = view_class(name), {k: value for k, value in options.items() if value is not None}
+    make = view_class(name)
+    options = {k: value for k, value in options.items() if value is not None}
     given = options | dict(mean=mean, std=std)
     pair = None if size is None else side_or_pair("size", size)
     try:

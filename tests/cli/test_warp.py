@@ -29,7 +29,7 @@ FLAT = json.dumps({"model": "Perspective", "fov_deg": 70})
 WIDE = json.dumps({"model": "Equidistant", "fov_deg": 110, "image_size": [400, 400]})
 VIEWS = [
     "cylindrical", "equirectangular", "mercator", "perspective", "square", "stereographic",
-    "tangent", "tiles:4", "tiles:5",
+    "tiles:4", "tiles:5",
 ]  # fmt: skip
 
 

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 import torch
-from helpers import relative_error
+from helpers import create, relative_error
 from torch import nn
 
-from darswin import create_model, optimize
+from darswin import optimize
 from darswin.deploy import packed
 from darswin.deploy import quantize as module
 from darswin.deploy.quantize import quantize_model, sensitivities
@@ -29,8 +29,8 @@ from darswin.models import ModelCard, load_model, save_model
 from darswin.ops import _module
 
 HAS_VNNI = onednn_lack(torch.int8) is None  # or another exact product of bytes, for other libraries
-MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano",
-          "darswin_unet_a_nano", "swin_unet_adapted_nano"]  # fmt: skip
+MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_nano perspective", "dat_nano",
+          "darswin_unet_a_nano", "swin_unet_nano square"]  # fmt: skip
 
 
 def network(name="darswin_a_nano", **options):
@@ -40,7 +40,7 @@ def network(name="darswin_a_nano", **options):
         options["image_size"] = 32
     if name.startswith("darswin_unet"):
         options |= dict(rings=8, sectors=16)
-    model = create_model(name, **(dict(num_classes=10) | options)).eval()
+    model = create(name, **(dict(num_classes=10) | options)).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
