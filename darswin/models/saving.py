@@ -186,7 +186,10 @@ def _parsed(entry: str) -> ModelCard:
         fits, expected = _FIELDS[name]
         if not fits(value):
             raise ValueError(f"its {name} must be {expected}, got {short(value)}")
-    return card_of(known)
+    try:
+        return card_of(known)
+    except TypeError as error:  # of an angle that is no number
+        raise ValueError(f"its options {short(known['options'])} have a wrong type") from error
 
 
 def card_of(values: Mapping[str, Any]) -> ModelCard:
