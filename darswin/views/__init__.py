@@ -1,5 +1,8 @@
 """What a network sees of a picture through a lens: one file for each view, registered by name."""
 
+import importlib
+import pkgutil
+
 from darswin.views.base import (
     PixelGrid,
     PolarGrid,
@@ -46,3 +49,6 @@ __all__ = [
     "turned",
     "up_of",
 ]
+
+for _module in pkgutil.iter_modules(__path__):  # each registers its view
+    importlib.import_module(f"{__name__}.{_module.name}")
