@@ -32,9 +32,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "U-Net, equirectangular": ("conv_unet", with_options(**EQUIRECTANGULAR)),
     "Swin-Unet, Mercator": ("swin_unet", with_options(**MERCATOR, window=[3, 7])),
     "Swin-Unet, equirectangular": ("swin_unet", with_options(**EQUIRECTANGULAR, window=[7, 3])),
-    "LensAdapter, lens augmentation": (
-        "swin_unet", (*with_options(view="square"), *THROUGH_ANY)
-    ),
+    "LensAdapter, lens augmentation": ("swin_unet", (*with_options(view="square"), *THROUGH_ANY)),
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
 # The models of a new study; the others are in an older record.

@@ -7,7 +7,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from darswin.calibrate import Calibration
+from darswin.calibrate import CalibratedLens
 from darswin.lens import Lens
 from darswin.viz.plot import HATCH, TEXT, page_figure
 
@@ -17,7 +17,7 @@ STEPS = 60  # of the map, along the image's longer side
 LONGEST = 0.08  # of the image's width: the arrow of a residual that 95 % do not exceed
 
 
-def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Figure:
+def draw_calibration(found: CalibratedLens, corners: np.ndarray, lens: Lens) -> Figure:
     """Draws the corners coloured by θ, their residuals, the standard deviation of the projection
     over the picture, and r(θ) with twice its standard deviation.
 
@@ -70,7 +70,7 @@ def _draw_residuals(
     axes.quiverkey(arrows, 0.5, -0.1, round_, f"{round_:g} px", labelpos="E", color="C0")
 
 
-def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:
+def _draw_map(axes: Axes, found: CalibratedLens, lens: Lens) -> None:
     height, width = lens.image_size[0].tolist()
     step = max(height, width) / STEPS
     y, x = (torch.arange(step / 2 - 0.5, side - 0.5, step).double() for side in (height, width))
@@ -84,7 +84,7 @@ def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:
     axes.figure.colorbar(drawn, ax=axes, location="bottom", pad=0.02, label="px", extend="max")
 
 
-def _draw_curve(axes: Axes, found: Calibration, lens: Lens) -> None:
+def _draw_curve(axes: Axes, found: CalibratedLens, lens: Lens) -> None:
     theta = torch.linspace(0, lens.theta_max.item(), 129, dtype=torch.float64)
     degrees, band = torch.rad2deg(theta), 2 * found.uncertainty_of_theta(theta)
     axes.plot(degrees, lens.project(theta), "k-")

@@ -82,9 +82,9 @@ def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
 
 
 @torch.no_grad()
-def test_calibration_and_quantized_models_come_to_the_same():
+def test_batches_and_quantized_models_come_to_the_same():
     model, seen = network(), batch()
-    direct = optimize(model, torch.int8, calibration=iter([(*seen, torch.zeros(4))]))
+    direct = optimize(model, torch.int8, batches=iter([(*seen, torch.zeros(4))]))
     by_model = optimize(quantize_model(model, [seen]), torch.int8)
     assert torch.equal(direct(*seen), by_model(*seen))
     images, lens = seen
@@ -222,7 +222,7 @@ def test_fastest(monkeypatch):
     monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
     want = optimize(quantized, torch.int8)(*seen)
     assert torch.equal(optimize(quantized, "fastest")(*seen), want)
-    assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
+    assert torch.equal(optimize(model, "fastest", batches=[seen])(*seen), want)
 
 
 @pytest.mark.slow
@@ -274,29 +274,29 @@ def test_wrong_arguments():
     assert sum(isinstance(m, Linear) for m in quantized.modules())  # the head is one still
     images = seen[0].clone()
     images[0, 0, 16, 16] = math.nan
-    for given, calibration, kind, message in (
+    for given, batches, kind, message in (
         (nn.Linear(2, 3), [seen], TypeError, "model of create_model, got Linear"),
         (quantized, [seen], ValueError, "quantized already"),
         *(
-            (model, wrong, TypeError, r"batches \(images, lens\)")
+            (model, wrong, TypeError, r"batches must be of \(images, lens\)")
             for wrong in (seen, seen[0], [(seen[0],)], [seen[0]], [(seen[0], 1.0)])
         ),
         (network().double(), [seen], ValueError, "float32 on the CPU"),
         (network().bfloat16(), [seen], ValueError, "float32 on the CPU"),
-        (model, [], ValueError, "no pictures"),
-        (model, [(seen[0][:0], seen[1])], ValueError, "no pictures"),
+        (model, [], ValueError, "have pictures, got none"),
+        (model, [(seen[0][:0], seen[1])], ValueError, "have pictures, got none"),
         (model, [(images, seen[1])], ValueError, "not finite"),
     ):
         with pytest.raises(kind, match=message):
-            quantize_model(given, calibration)
-    for given, dtype, calibration in (
+            quantize_model(given, batches)
+    for given, dtype, batches in (
         (quantized, torch.float32, None),
         (model, torch.bfloat16, [seen]),
         (model, torch.int8, None),
         (quantized, torch.int8, [seen]),
     ):
         with pytest.raises(ValueError, match=r"quantized? model|quantize_model"):
-            optimize(given, dtype, calibration=calibration)
+            optimize(given, dtype, batches=batches)
 
 
 def may_overflow(weight):

@@ -1,4 +1,4 @@
-"""A calibration: a lens, and how sure it is."""
+"""A calibrated lens: a lens, and how sure it is."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ from darswin.utils.arrays import as_tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration:
+class CalibratedLens:
     """A lens found from P pictures of a board with K corners, and how sure it is.
 
     Attributes:
