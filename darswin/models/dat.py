@@ -63,14 +63,14 @@ class DeformableAttention(nn.Module):
         offset = torch.tanh(self.offset(F.gelu(self.norm(around))))  # (B·G, H, W, 2): y, x
         # Positions in the map, in units of its half sides: -1 … 1 from edge to edge.
         pixels = _pixel_centers(height, width, offset)
-        places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
+        points = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
         # The released code samples as if the centres of the outermost pixels were at the edges.
-        sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
+        sampled = F.grid_sample(self._grouped(x), points.flip(-1), align_corners=True)
         sampled = sampled.unflatten(0, (batch, self.groups)).permute(0, 3, 4, 1, 2)
         sampled = sampled.reshape(batch, tokens, dim)
         k, v = self.kv(sampled).chunk(2, 2)
 
-        reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2
+        reach = (pixels.flatten(0, 1)[:, None] - points.flatten(1, 2)[:, None]) / 2
         table = table.unflatten(1, (self.groups, -1))
         table = table.expand(batch, -1, -1, -1, -1).flatten(0, 1)
         bias = F.grid_sample(table, reach.flip(-1), align_corners=True)  # (B·G, heads/G, N, N)

@@ -28,11 +28,11 @@ def draw_calibration(found: CalibratedLens, corners: np.ndarray, lens: Lens) -> 
     figure = page_figure(6.4)
     panels = figure.subplot_mosaic([["corners", "residuals"], ["map", "curve"]])
     seen = ~torch.isnan(found.theta).numpy()
-    places, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
+    points, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
     theta, counts = torch.rad2deg(found.theta).numpy()[seen], found.weights.numpy()[seen] > 0.1
-    dots = panels["corners"].scatter(places[:, 0], places[:, 1], c=theta, s=3, lw=0)
+    dots = panels["corners"].scatter(points[:, 0], points[:, 1], c=theta, s=3, lw=0)
     figure.colorbar(dots, ax=panels["corners"], location="bottom", pad=0.02, label="θ (°)")
-    _draw_residuals(panels["residuals"], places, misses, counts, lens)
+    _draw_residuals(panels["residuals"], points, misses, counts, lens)
     _draw_map(panels["map"], found, lens)
     _draw_curve(panels["curve"], found, lens)
     height, width = lens.image_size[0].tolist()
@@ -54,7 +54,7 @@ def draw_calibration(found: CalibratedLens, corners: np.ndarray, lens: Lens) -> 
 
 
 def _draw_residuals(
-    axes: Axes, places: np.ndarray, misses: np.ndarray, counts: np.ndarray, lens: Lens
+    axes: Axes, points: np.ndarray, misses: np.ndarray, counts: np.ndarray, lens: Lens
 ) -> None:
     """Draws arrows from corners to where the lens sees them, red for those that count little."""
     length = np.linalg.norm(misses, axis=1)
@@ -63,7 +63,7 @@ def _draw_residuals(
     # Wrong corners would have arrows across the whole picture.
     shown = misses * np.minimum(1, 2 * usual / length.clip(1e-9))[:, None]
     arrows = axes.quiver(
-        *places.T, *shown.T, color=np.where(counts, "C0", "red"), angles="xy", scale_units="xy",
+        *points.T, *shown.T, color=np.where(counts, "C0", "red"), angles="xy", scale_units="xy",
         scale=usual / (LONGEST * width), width=0.004,
     )  # fmt: skip
     round_ = float(f"{usual:.1g}")
