@@ -161,7 +161,7 @@ def test_the_views_show_all_that_the_picture_shows_by_default(folder, capsys):
     lens = Equidistant(50.0, image_size=SIZE)  # 146.7° in the row of the principal point
     (folder / "own.json").write_text(json.dumps(to_dict(lens) | {"theta_max": 64 / 50}))
     for view, fov, size in (
-        ("perspective", 110, "128 × 96 px"),
+        ("perspective", 100, "128 × 96 px"),
         ("cylindrical", 146.7, "128 × 64 px"),
         ("equirectangular", 146.7, "128 × 96 px"),
         ("mercator", 146.7, "128 × 96 px"),
@@ -233,7 +233,7 @@ def test_folders_are_undistorted_and_what_is_broken_is_named(mixed, capsys):
     for name, size in (("large.bmp", (192, 256)), ("front/a.png", SIZE), ("clip.mkv", SIZE)):
         camera = cameras.lens_of(out / name, size)
         assert math.isclose(
-            camera.focal.item(), size[1] / 2 / math.tan(math.radians(55)), rel_tol=1e-5
+            camera.focal.item(), size[1] / 2 / math.tan(math.radians(50)), rel_tol=1e-5
         )
 
 
@@ -337,7 +337,7 @@ def test_one_plan_serves_all_pictures_of_one_size(mixed, monkeypatch):
         ),
         (["in", "--view=square", "--up=0,-1,0"], "--up must be left out for a square view"),
         (["in", "--view=panorama", "--fov=300"], "--fov_deg must be 360° for a panorama view"),
-        (["in", "--view=fisheye"], "--view must be one of perspective, cylindrical"),
+        (["in", "--view=fisheye"], "--view must be one of cylindrical, equirectangular"),
         (["in", "--yaw_deg=400"], "--yaw_deg must be from -360° to 360°, got 400"),
         (["in", "--theta_max_deg=0"], "--theta_max_deg must be above 0°"),
         (["in", "--size=0,9"], "--size must be at least 2,2"),
