@@ -12,6 +12,7 @@ from darswin import boxes, frames, views
 from darswin.calibrate import calibrate
 from darswin.calibrate.inputs import checked
 from darswin.data import FullSize, Moved, Turn, at_size
+from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial
 from darswin.viz import pixels
 from darswin.viz.plot import draw_polar
@@ -29,7 +30,7 @@ VALUES = RNG.uniform(1, 9, (48, 48)).astype(np.float32)
 PLACES = RNG.uniform(10, 40, (6, 2))
 BOXES = np.concatenate((PLACES, PLACES + 8), 1)
 FULL, MOVED = FullSize(CAMERA, 48, "crop"), Moved(CAMERA, (4, 4, 40, 40), (30, 30), Turn(0.3))
-PLAN = frames.plan(ROOM, CAMERA, SIZE)
+PLAN = camera.plan(ROOM, CAMERA, SIZE)
 FOUND = calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
 
 

@@ -156,7 +156,8 @@ class _Views:
         return self._plans[key]
 
     def _planned(self, lens: Lens, size: tuple[int, int], even: bool) -> _Viewed:
-        from darswin.frames import Sampler, plan
+        from darswin.deploy.camera import plan
+        from darswin.frames import Sampler
 
         exact = lens.to(torch.float64)
         side = min(size) if self._look.view == "square" else max(size)
