@@ -210,6 +210,7 @@ def _plan_of(
     if found.samples is None:
         points = points.double().numpy()
         return Plan.of_points(points, size, tiles=found.tiles, reads=found.reads, **form)
-    grid = (points.radii, points.azimuths, points.center, points.affine, points.offsets)
-    arrays = (None if of is None else of.float().numpy() for of in grid)
-    return Plan.of_grid(*arrays, size, samples=found.samples, **form)
+    names = ("radii", "azimuths", "center", "affine", "offsets")
+    parts = {name: getattr(points, name) for name in names}
+    grid: Any = {k: None if part is None else part.float().numpy() for k, part in parts.items()}
+    return Plan.of_grid(**grid, size=size, samples=found.samples, **form)

@@ -145,14 +145,15 @@ class Plan:
         size = check_size(size)
         arrays = frames.polar_places(radii, azimuths, center, affine, offsets, size)
         if output == "tokens":
-            (rows, columns), (sr, sa) = arrays[0].shape, samples
+            (rings, turns), (sr, sa) = arrays[0].shape, samples
             arrays = tuple(
                 np.ascontiguousarray(
-                    array.reshape(rows // sr, sr, columns // sa, sa).transpose(0, 2, 1, 3)
+                    array.reshape(rings // sr, sr, turns // sa, sa).transpose(0, 2, 1, 3)
                 )
                 for array in arrays
             )
-        return cls(*arrays, size, output, tuple(mean), tuple(std))
+        columns, rows, right, lower = arrays
+        return cls(columns, rows, right, lower, size, output, tuple(mean), tuple(std))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
