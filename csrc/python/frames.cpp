@@ -11,6 +11,7 @@
 #include <span>
 #include <string>
 #include <system_error>
+#include <type_traits>
 #include <vector>
 
 #include "../core/dispatch.h"
@@ -210,6 +211,75 @@ py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
   return py::make_tuple(columns, rows, right, lower);
 }
 
+// The mean of the picture (H, W, C) at n points, each read bilinearly between its four pixels, with
+// 0 outside. Points of which nothing is inside, and NaN, are skipped.
+template <typename T>
+void add_points(const T* picture, int64_t height, int64_t width, int64_t channels,
+                const float* points, int64_t n, float* sum) {
+  for (int64_t i = 0; i < n; ++i) {
+    const float x = points[2 * i], y = points[2 * i + 1];
+    if (!(x > -1 && x < width && y > -1 && y < height)) continue;
+    // Truncation is the floor of what is above 0.
+    const int64_t column = static_cast<int64_t>(x + 1) - 1, row = static_cast<int64_t>(y + 1) - 1;
+    const float right = x - column, lower = y - row;
+    for (int64_t below = 0; below < 2; ++below) {
+      const int64_t r = row + below;
+      if (r < 0 || r >= height) continue;
+      const float of_row = below ? lower : 1 - lower;
+      for (int64_t beside = 0; beside < 2; ++beside) {
+        const int64_t c = column + beside;
+        if (c < 0 || c >= width) continue;
+        const float weight = of_row * (beside ? right : 1 - right);
+        const T* pixel = picture + (r * width + c) * channels;
+        for (int64_t k = 0; k < channels; ++k) sum[k] += weight * pixel[k];
+      }
+    }
+  }
+}
+
+// A picture (H, W, C) at points (k·H', k·W', 2): (H', W', C), each the mean of k² points. For a
+// picture or two through one lens: a sampler first arranges the points for many.
+template <typename T>
+py::array_t<T> read(const Array<T>& picture, const Array<float>& points, int64_t reads) {
+  if (picture.ndim() != 3 || points.ndim() != 3 || points.shape(2) != 2 || reads < 1 ||
+      points.shape(0) % reads || points.shape(1) % reads) {
+    throw py::value_error("expected a picture (H, W, C), and points (k·H', k·W', 2)");
+  }
+  const int64_t height = picture.shape(0), width = picture.shape(1), channels = picture.shape(2);
+  const int64_t rows = points.shape(0) / reads, columns = points.shape(1) / reads;
+  py::array_t<T> result({rows, columns, channels});
+  const T* from = picture.data();
+  const float* place = points.data();
+  T* to = result.mutable_data();
+  const py::gil_scoped_release others_may_run;
+  std::vector<float> sum(channels);
+  const float share = 1.0f / (reads * reads);
+  for (int64_t y = 0; y < rows; ++y) {
+    for (int64_t x = 0; x < columns; ++x, to += channels) {
+      std::fill(sum.begin(), sum.end(), 0.0f);
+      for (int64_t k = 0; k < reads; ++k) {
+        const float* of_row = place + 2 * ((y * reads + k) * columns + x) * reads;
+        if (channels == 3) {
+          add_points(from, height, width, 3, of_row, reads, sum.data());
+        } else if (channels == 1) {
+          add_points(from, height, width, 1, of_row, reads, sum.data());
+        } else {
+          add_points(from, height, width, channels, of_row, reads, sum.data());
+        }
+      }
+      for (int64_t c = 0; c < channels; ++c) {
+        const float mean = sum[c] * share;
+        if constexpr (std::is_same_v<T, uint8_t>) {
+          to[c] = static_cast<uint8_t>(mean < 255 ? mean + 0.5f : 255.0f);
+        } else {
+          to[c] = mean;
+        }
+      }
+    }
+  }
+  return result;
+}
+
 }  // namespace
 }  // namespace darswin
 
@@ -241,4 +311,6 @@ PYBIND11_MODULE(_frames, m) {
   });
   m.def("network", &open_network);
   m.def("polar_places", &polar_places);
+  m.def("read", &read<uint8_t>, py::arg().noconvert(), py::arg(), py::arg());
+  m.def("read", &read<float>, py::arg().noconvert(), py::arg(), py::arg());
 }

@@ -56,7 +56,7 @@ def carry(
     table = table_of(boxes)
     # Reductions along a contiguous axis are several times as fast.
     x, y = np.ascontiguousarray(np.moveaxis(through(points_map, ellipses(table)), -1, 0))
-    carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1) if len(table) else table
+    carried = np.stack((_least(x), _least(y), -_least(-x), -_least(-y)), 1) if len(table) else table
     whole = ~np.isnan(carried[:, 0])
     if size is not None:
         whole &= (clip(carried, size) == carried).all(1)
@@ -68,6 +68,16 @@ def carry(
     for k, (parts, share) in zip(cut, shown, strict=True):
         carried[k], visible[k] = box_of([part.new for part in parts]), share
     return like(boxes, carried), like(boxes, visible)
+
+
+def _least(values: np.ndarray) -> np.ndarray:
+    """The least value of closed smooth curves (K, P), between the points too: that of the parabola
+    through the least one and its neighbours."""
+    row, k = np.arange(len(values)), values.argmin(1)
+    last, least, ahead = (values[row, (k + step) % values.shape[1]] for step in (-1, 0, 1))
+    bend = last - 2 * least + ahead
+    below = np.divide((ahead - last) ** 2, 8 * bend, out=np.zeros(len(row)), where=bend > 0)
+    return least - np.where(below < 0.01 * (values.max(1) - least), below, 0)  # 0 at a seam
 
 
 def ellipses(boxes: Array, count: int = _COUNT) -> np.ndarray:

@@ -16,9 +16,8 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.cli.arguments import can_write
-from darswin.data.reframing import at_size
+from darswin.data.framing import CutOff, FullSize, cut_off, fitted
 from darswin.data.scenes.targets import IGNORE, PER_METRE
-from darswin.data.warping import CutOff, FullSize, cut_off, picture_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -28,7 +27,8 @@ from darswin.models.saving import ModelCard
 from darswin.ops import _module
 from darswin.utils.files import replace_file
 from darswin.utils.tasks import Fit
-from darswin.views import Prepared
+from darswin.views import Prepared, Remap
+from darswin.views.camera import picture_size
 from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
@@ -88,6 +88,15 @@ class Answers:
         return self._kept[id(lens)][1]
 
 
+class Seen(NamedTuple):
+    """What depends on a lens alone: how its pictures get the model's size, what the model prepares
+    for them, and the way back to their pixels, if the predictions need it."""
+
+    remap: Remap
+    prepared: Prepared
+    full: FullSize | None
+
+
 class ModelAnswers(Answers):
     """Predicts by a model of darswin.
 
@@ -103,22 +112,22 @@ class ModelAnswers(Answers):
         self._warned = False
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
-        pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
-
-            def prepare() -> tuple[Prepared, FullSize | None]:
-                with torch.inference_mode():
-                    size = (pixels.shape[2], pixels.shape[3])
-                    prepared = self.model.prepare(resized_lens, size)
-                self._warn_of_cut_off(lens)
-                return prepared, self._full_size(lens, prepared)
-
-            self._prepared: tuple[Prepared, FullSize | None] = self._once(lens, prepare)
+            self._seen: Seen = self._once(lens, lambda: self._seen_by(lens))
             self._lens = lens
+        pixels = torch.from_numpy(self._seen.remap(image)[None]).permute(0, 3, 1, 2).contiguous()
         self._queue.append(Request(entry, image, pixels))
         if len(self._queue) == BATCH:
             self.flush()
+
+    def _seen_by(self, lens: Lens) -> "Seen":
+        size, fit = picture_size(lens), framing_of(self.model, self.card)
+        remap = fitted(size, self.card.size, fit).at(lens, size)
+        with torch.inference_mode():
+            prepared = self.model.prepare(remap.camera, remap.view_size)
+        self._warn_of_cut_off(lens)
+        return Seen(remap, prepared, self._full_size(remap, prepared))
 
     def _warn_of_cut_off(self, lens: Lens) -> None:
         """Warns once if the model does not see whole pictures."""
@@ -141,7 +150,7 @@ class ModelAnswers(Answers):
         queue, self._queue = self._queue, []
         if not queue:
             return
-        prepared, full = self._prepared
+        _, prepared, full = self._seen
         images = torch.cat([request.pixels for request in queue])
         start = time.perf_counter()
         with torch.inference_mode():
@@ -157,8 +166,8 @@ class ModelAnswers(Answers):
                 )
             self.found.append(request.entry | self._answer(request, output, full))
 
-    def _full_size(self, lens: Lens, prepared: Prepared) -> FullSize | None:
-        """The mapping to the pixels of the lens's pictures, if the predictions need it."""
+    def _full_size(self, remap: Remap, prepared: Prepared) -> FullSize | None:
+        """The way back to the pixels of the pictures, if the predictions need it."""
         return None
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -201,8 +210,8 @@ class PixelAnswers(ModelAnswers):
         super().__init__(fast(model, card), card)
         self.out, self.names = out, names
 
-    def _full_size(self, lens: Lens, prepared: Prepared) -> FullSize:
-        return FullSize(lens, self.card.size, framing_of(self.model, self.card), prepared.shown)
+    def _full_size(self, remap: Remap, prepared: Prepared) -> FullSize:
+        return FullSize(remap, prepared.shown)
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.model.run(images, prepared)
@@ -301,12 +310,6 @@ def fast(model: Net, card: ModelCard) -> Net:
     if _module.LACK is not None:
         return model.eval()
     return optimize(model, "fastest" if card.quantized else torch.float32)
-
-
-def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
-    """A picture at the size of training, (1, C, H, W) uint8, with the lens of its pixels."""
-    image, lens = at_size(image, lens, card.size, framing_of(net, card))
-    return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
 def framing_of(net: Model, card: ModelCard) -> Fit:

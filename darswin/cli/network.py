@@ -18,15 +18,14 @@ from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_ov
 from darswin.cli.names import read_names
 from darswin.cli.views import named_view
 from darswin.data.scenes.targets import IGNORE
-from darswin.deploy.camera import plan
-from darswin.frames import Plan, Sampler
+from darswin.frames import Sampler
 from darswin.frames.onnx import Detections, OnnxNetwork
 from darswin.lens import Lens
 from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
-from darswin.views import PlainView
+from darswin.views import PlainView, Remap
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
@@ -83,9 +82,8 @@ class Boxes:
 class Seen(NamedTuple):
     """The view of the pictures of one camera."""
 
+    remap: Remap
     sampler: Sampler
-    lens: Lens  # float64
-    back: Any  # what the view prepares for maps; None for others
 
 
 class NetworkAnswers(Answers):
@@ -174,40 +172,28 @@ class NetworkAnswers(Answers):
         self.found.append(entry | answer)
 
     def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
-        lens, back = lens.detach().to(torch.float64), None
-        if not isinstance(self.view, PlainView):
-            made = plan(
-                self.view, lens, size, output=self.network.output, mean=self._mean, std=self._std
-            )
-        elif size == self.network.size:
-            rows, columns = np.indices(size, np.int16)
-            zeros = np.zeros(size, np.float32)
-            made = Plan(
-                columns, rows, zeros, zeros, size, self.network.output, self._mean, self._std
-            )
-        else:
+        if isinstance(self.view, PlainView) and size != self.network.size:
             (height, width), (own_height, own_width) = size, self.network.size
             raise ValueError(
                 f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}: "
                 "choose a view that resamples it"
             )
+        remap = self.view.at(lens, size)
+        output = self.network.output
+        made = remap.plan(output, mean=self._mean, std=self._std)
         if (made.columns < -1).all():
             raise ValueError("it shows nothing of the picture: choose another, or check the lens")
-        if self.network.kind == "maps":
-            with torch.inference_mode():
-                back = self.view.prepare(lens, size, rays=False)
-        return Seen(Sampler(made), lens, back)
+        return Seen(remap, Sampler(made))
 
     def _detections(
         self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
     ) -> dict[str, Any]:
         """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
-        size, parts = image.shape[:2], []
+        parts = []
         self._boxes.add(found)
-        for tile, (inner, *others) in enumerate(found):
-            inner = boxes.clip(inner, self.network.size)
-            carried, visible = boxes.carry(inner, partial(self._to_image, seen, size, tile), size)
-            kept = (inner[:, :2] < inner[:, 2:]).all(1) & (visible > 0)
+        for tile, (inner, *others) in zip(seen.remap.tiles, found, strict=True):
+            carried, visible, _ = tile.boxes_to_image(inner)
+            kept = visible > 0
             parts.append([values[kept] for values in (carried, visible, *others)])
         carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
         if len(found) == 1:  # a network knows best which of its own boxes are one thing
@@ -216,10 +202,7 @@ class NetworkAnswers(Answers):
             order = boxes.merge(carried, scores, labels)
         carried, visible, scores, labels = (v[order] for v in (carried, visible, scores, labels))
 
-        def to_rays(points: np.ndarray) -> np.ndarray:
-            return seen.lens.unproject_points(torch.from_numpy(points)[None], size)[0].numpy()
-
-        there = boxes.spherical(carried, to_rays)
+        there = boxes.spherical(carried, seen.remap.rays_of_image)
         names = [self._name(label) for label in labels.tolist()]
         colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
         texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
@@ -240,15 +223,6 @@ class NetworkAnswers(Answers):
         ]
         name = file_of(entry, self._names)
         return {"overlay": write_overlay(self._out, name, picture), "detections": entries}
-
-    def _to_image(
-        self, seen: Seen, size: tuple[int, int], tile: int, points: np.ndarray
-    ) -> np.ndarray:
-        """Pixels (..., 2) of a tile of the view in the picture; NaN beyond the end of the lens."""
-        if isinstance(self.view, PlainView):
-            return points
-        of_tile = {"tile": tile} if self.view.count > 1 else {}
-        return self.view.to_image(points, seen.lens, size, **of_tile)
 
     def _name(self, label: int) -> str | int:
         """The name of a class, or its number if there are no names."""
@@ -274,8 +248,7 @@ class NetworkAnswers(Answers):
             name = f"{folder}/{file_of(entry, self._names)}"
             is_ids = values.dtype.kind in "biu"  # of classes or things
             maps = torch.from_numpy(values.astype(np.int64 if is_ids else np.float32))
-            with torch.inference_mode():
-                planes = self.view.back(maps, seen.back)[0].numpy()
+            planes = seen.remap.back(maps)[0].numpy()
             content = io.BytesIO()
             np.save(content, planes)
             replace_file(self._out / f"maps/{name}.npy", content.getbuffer())
@@ -285,8 +258,7 @@ class NetworkAnswers(Answers):
                 continue
             if labels.min() < 0 or labels.max() > IGNORE:
                 continue  # ids of things
-            if seen.back.shown is not None:
-                labels = np.where(seen.back.shown[0], labels, IGNORE)
+            labels = np.where(seen.remap.shown, labels, IGNORE)
             colors = palette(IGNORE if is_ids else len(planes))
             answer[output] |= self._labels(name, image, labels.astype(np.uint8), colors)
         return answer

@@ -156,9 +156,6 @@ class _Views:
         return self._plans[key]
 
     def _planned(self, lens: Lens, size: tuple[int, int], even: bool) -> _Viewed:
-        from darswin.deploy.camera import plan
-        from darswin.frames import Sampler
-
         exact = lens.to(torch.float64)
         side = min(size) if self._look.view == "square" else max(size)
         if self._theta_max_deg is not None:
@@ -177,7 +174,7 @@ class _Views:
         if self._look.view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
             camera = to_corners(Perspective.from_fov(fov, width / 2, image_size=(height, width)))
-        return _Viewed(Sampler(plan(view, exact, size, output="uint8")), lens, camera)
+        return _Viewed(view.at(exact, size).sampler(), lens, camera)
 
 
 def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path, Lens | None]:

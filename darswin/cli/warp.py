@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,15 +17,12 @@ import cv2
 import numpy as np
 import torch
 
-from darswin.boxes import carry_mask
 from darswin.cli.predict import is_below
 from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
-from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, Move, move_things
+from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_things
 from darswin.data.labels.yolo import is_yolo, moved_splits
-from darswin.data.reframing import Warped
-from darswin.data.warping import picture_size
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
@@ -41,7 +38,8 @@ from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
 from darswin.utils.text import read_json
-from darswin.views import PixelView, RayView, list_views
+from darswin.views import CameraView, PixelView, list_views
+from darswin.views.camera import picture_size
 
 RECORD, LENS, VIEW, LEFT = "warp.json", "lens.json", "view.json", "left.json"
 COCO, PICTURES = "annotations.json", "images"
@@ -88,7 +86,7 @@ def warp(
     """
     check("processes", processes, processes >= 1, "at least 1")
     check("size", size, size is None or min(size) >= 1, "at least 1,1")
-    target = _target(to, size, fov_deg, up)
+    view = _view(to, size, fov_deg, up)
     data = open_labels(source, pictures)
     if lens is not None:
         root = "." if is_json(lens) else data.folder
@@ -104,22 +102,22 @@ def warp(
             "name them relative to their folder"
         )
     in_yolo = is_yolo(Path(source))
-    _check_names(data, 1 if isinstance(target, Lens) else target.count, in_yolo)
+    _check_names(data, view.count, in_yolo)
     settings = dict(
         source=os.path.abspath(source), to=to, size=size, fov_deg=fov_deg, up=up, lens=lens,
         camera=camera, coefficients=coefficients, pictures=os.path.abspath(data.folder),
         cameras=data.lenses.digest(),
-        target=to_dict(target) if isinstance(target, Lens) else None,
+        target=to_dict(view.lens) if isinstance(view, CameraView) else None,
     )  # fmt: skip
     folder = _claim(out, settings)
-    work = _Work(replace(data, files=(), raw=(), entries=()), target,
+    work = _Work(replace(data, files=(), raw=(), entries=()), view,
                  folder if in_yolo else folder / PICTURES)  # fmt: skip
     found: list[_Warped] = []
     with Progress("warp", len(data)) as progress, _pool(work, processes) as each:
         for one in each(data.files, data.raw):
             found.append(one)
             progress.done += 1
-    _write(folder, data, target, found, settings | {"yolo": source if in_yolo else None})
+    _write(folder, data, view, found, settings | {"yolo": source if in_yolo else None})
 
 
 class _Left(NamedTuple):
@@ -145,48 +143,16 @@ class _Warped(NamedTuple):
     wrong: Sequence[str] = ()  # things that cannot be read
 
 
-class _InView:
-    """A picture as a view, or a tile of it, shows it: a `Move`."""
-
-    mirrored = False
-
-    def __init__(self, view: PixelView, lens: Lens, old: tuple[int, int], tile: int):
-        assert view.size is not None
-        self.size, self._lens, self._old = view.size, lens.to(torch.float64), old
-        self._view = view.for_lens(self._lens, old) if isinstance(view, RayView) else view
-        self._tile = {"tile": tile} if view.count > 1 else {}
-
-    def to_new(self, points: np.ndarray) -> np.ndarray:
-        return self._view.to_view(points, self._lens, self._old, **self._tile)
-
-    def target(self, target: np.ndarray) -> np.ndarray:
-        return carry_mask(target, lambda _: self._places, self.size)
-
-    @cached_property
-    def _places(self) -> np.ndarray:
-        y, x = np.mgrid[: self.size[0], : self.size[1]].astype(float)
-        return self._view.to_image(np.stack((x, y), -1), self._lens, self._old, **self._tile)
-
-
 class _Maps:
-    """What pictures of one lens become: pictures of another lens, or of a view."""
+    """What pictures of one lens become: pictures of another camera, or of a view."""
 
-    def __init__(self, lens: Lens, target: Lens | PixelView):
-        self.lens, self.seen, old = lens, to_corners(lens), picture_size(lens)
-        self.said = json.dumps(to_dict(self.seen))
-        if isinstance(target, Lens):
-            warped = Warped(self.seen, target)
-            self.moves: list[Move] = [warped]
-            self.images = lambda image: [warped.image(image)]
-            return
-        self.moves = [_InView(target, self.seen, old, k) for k in range(target.count)]
-        prepared = target.prepare(self.seen, old, back=False, rays=False)
+    def __init__(self, lens: Lens, view: PixelView):
+        self.lens, seen = lens, to_corners(lens)
+        self.remap = view.at(seen, picture_size(lens))
+        self.said = json.dumps(to_dict(seen))
 
-        def images(image: np.ndarray) -> list[np.ndarray]:
-            seen = target.see(torch.from_numpy(image.transpose(2, 0, 1).copy())[None], prepared)
-            return [*(seen * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()]
-
-        self.images = images
+    def pictures(self, image: np.ndarray) -> Sequence[np.ndarray]:
+        return self.remap(image).reshape(len(self.remap.tiles), *self.remap.view_size, -1)
 
 
 @dataclass
@@ -194,7 +160,7 @@ class _Work:
     """Writes the new pictures of a picture, unless they are there, and moves its labels."""
 
     data: LabelledPictures
-    target: Lens | PixelView
+    view: PixelView
     folder: Path
     maps: dict[int, _Maps] = field(default_factory=dict)
 
@@ -211,24 +177,24 @@ class _Work:
         header = read_header(name)
         labels, wrong = self.data.read(raw, header.upright)
         maps = self._maps_of(self.data.lenses.lens_of(name, header.upright, header.orientation))
-        files = _new_names(file, len(maps.moves))
+        files = _new_names(file, self.view.count)
         if not all((self.folder / file).is_file() for file in files):
             image, orientation = read_oriented(name, header.channels)
             if (image.shape[:2], orientation) != (header.upright, header.orientation):
                 raise BrokenImageError(
                     f"cannot read {name}: its orientation stands behind its pixels"
                 )
-            for file, picture in zip(files, maps.images(image), strict=True):
+            for file, picture in zip(files, maps.pictures(image), strict=True):
                 write_image(self.folder / file, picture)
-        moved = [move_things(labels.things, move) for move in maps.moves]
+        moved = [move_things(labels.things, tile) for tile in maps.remap.tiles]
         left = [
             _Left(thing, [one.visible for one in tiles])
             for thing, *tiles in zip(labels.things, *moved, strict=True)
             if all(one.visible < LEAST_VISIBLE for one in tiles)
         ]
         shown = [
-            Labels([thing for thing in things if thing.visible >= LEAST_VISIBLE], move.size)
-            for things, move in zip(moved, maps.moves, strict=True)
+            Labels([thing for thing in things if thing.visible >= LEAST_VISIBLE], tile.view_size)
+            for things, tile in zip(moved, maps.remap.tiles, strict=True)
         ]
         return _Warped([*zip(files, shown, strict=True)], left, maps.said, wrong=wrong)
 
@@ -236,7 +202,7 @@ class _Work:
         if id(lens) not in self.maps:
             if len(self.maps) == _KEPT:
                 del self.maps[next(iter(self.maps))]
-            self.maps[id(lens)] = _Maps(lens, self.target)
+            self.maps[id(lens)] = _Maps(lens, self.view)
         return self.maps[id(lens)]  # it keeps the lens, and so its identity
 
 
@@ -292,10 +258,10 @@ def _one(file: str, raw: Any) -> _Warped:
     return _work[0](file, raw)
 
 
-def _target(
+def _view(
     to: str, size: tuple[int, int] | None, fov_deg: float | None, up: Sequence[float] | None
-) -> Lens | PixelView:
-    """The new camera, or the view."""
+) -> PixelView:
+    """The view, or the new camera as one."""
     if to.partition(":")[0] in list_views():
         view = named_view("to", to, size or _SIZE, fov_deg=fov_deg, up=up)
         if not view.uses_lens:
@@ -310,7 +276,7 @@ def _target(
     lens = calibration.lens(image_size=size)
     if lens.image_size is None:
         raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
-    return to_corners(lens if size is None else lens.in_picture(size))
+    return CameraView(to_corners(lens if size is None else lens.in_picture(size)))
 
 
 def _claim(out: str, settings: dict[str, Any]) -> Path:
@@ -332,7 +298,7 @@ def _claim(out: str, settings: dict[str, Any]) -> Path:
 
 
 def _write(
-    folder: Path, data: LabelledPictures, target: Lens | PixelView, found: Sequence[_Warped],
+    folder: Path, data: LabelledPictures, view: PixelView, found: Sequence[_Warped],
     settings: Mapping[str, Any],
 ) -> None:  # fmt: skip
     """Writes the labels, the new camera or view, and the report, and prints it."""
@@ -353,13 +319,13 @@ def _write(
             print(f"left out of data.yaml, because it is not in {data.folder}: {split}")
     else:
         write_coco(folder / COCO, pictures, data.categories)
-    if isinstance(target, Lens):
-        save(target, folder / LENS)
+    if isinstance(view, CameraView):
+        save(view.lens, folder / LENS)
     else:
         lenses = [json.loads(said) for said in dict.fromkeys(one.lens for one in found) if said]
-        view = {name: settings[name] for name in ("fov_deg", "up")}
-        view = {"view": settings["to"], "size": target.size} | view | {"lenses": lenses}
-        replace_file(folder / VIEW, json.dumps(view, indent=1))
+        options = {name: settings[name] for name in ("fov_deg", "up")}
+        record = {"view": settings["to"], "size": view.size} | options | {"lenses": lenses}
+        replace_file(folder / VIEW, json.dumps(record, indent=1))
     names = {category["id"]: category["name"] for category in data.categories}
     left = [
         {

@@ -2,9 +2,9 @@
 
 from darswin.data.augment import Mixing, RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations
+from darswin.data.framing import FullSize, fitted
 from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
 from darswin.data.pictures import open_source
-from darswin.data.reframing import Moved, RandomTurns, Reframing, Turn, Warped, at_size, reframe
 from darswin.data.sample import Sample
 from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
@@ -12,7 +12,7 @@ from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import LeftOut
-from darswin.data.warping import FullSize, lens_at_size, warp_map
+from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import WideAngle
 
 __all__ = [
@@ -23,24 +23,17 @@ __all__ = [
     "FullSize",
     "LeftOut",
     "Mixing",
-    "Moved",
     "PolynomialLenses",
     "RandAugment",
     "RandomErasing",
     "RandomTurns",
-    "Reframing",
     "Sample",
     "SceneSamples",
     "Scenes",
     "SphericalLenses",
-    "Turn",
-    "Warped",
     "WideAngle",
-    "at_size",
-    "lens_at_size",
+    "fitted",
     "open_scenes",
     "open_source",
     "parse_lenses",
-    "reframe",
-    "warp_map",
 ]

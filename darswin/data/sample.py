@@ -1,11 +1,12 @@
 """A picture, its target and its lens, which move together."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from darswin.data.labels.labels import Labels
+from darswin.data.labels.labels import Labels, moved
 from darswin.lens import Lens
+from darswin.views import PixelView
 
 
 class Sample(NamedTuple):
@@ -19,3 +20,15 @@ class Sample(NamedTuple):
     image: np.ndarray
     target: np.ndarray | Labels | int | None
     lens: Lens
+
+    def through(self, view: PixelView) -> Self:
+        """The sample as a view of a camera shows it, a `CameraView` or a `CropView`; a class stays
+        as it is, and `Labels` follow as `moved` says."""
+        remap = view.at(self.lens, (self.image.shape[0], self.image.shape[1]))
+        target = self.target
+        if isinstance(target, np.ndarray):
+            target = remap.target(target)
+        elif isinstance(target, Labels):
+            target = moved(target, remap)
+        assert remap.camera is not None
+        return self._replace(image=remap(self.image), target=target, lens=remap.camera)

@@ -10,16 +10,21 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from darswin.data.cameras import Calibrations
+from darswin.data.framing import Crop, cut_off, taken_part
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
-from darswin.data.reframing import STILL, Moved, RandomTurns, Reframing, Turn, Warped, reframe
 from darswin.data.sample import Sample
 from darswin.data.scenes.scene import Scenes
-from darswin.data.warping import Crop, Part, cut_off, picture_size, taken_part
+from darswin.data.turns import RandomTurns
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, Header, read_header
 from darswin.utils.parameters import check
 from darswin.utils.tasks import Fit
+from darswin.views import CameraView, CropView, PixelView
+from darswin.views.base import Pair
+from darswin.views.camera import picture_size
+from darswin.views.crop import Part
+from darswin.views.turn import STILL, Turn
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -107,7 +112,9 @@ class Samples(Dataset):
             self._broken[draw.picture] = True
             black = torch.from_numpy(-self.mean / self.std)
             black = black.expand(-1, self.size, self.size).clone()
-            return black, self._reframing(self._lens_alone(draw), draw).lens, self._unknown()
+            alone = self._lens_alone(draw)
+            lens = self._view(alone, draw).camera(alone, picture_size(alone))
+            return black, lens, self._unknown()
         rng = self._random(draw.epoch, draw.picture, 0)
         if self.augment:
             image = self.augment(image, rng)
@@ -140,15 +147,15 @@ class Samples(Dataset):
     def shown(self, draw: Draw) -> Sample:
         """The sample at the size, before its colours are changed, with an image (H, W, C) uint8."""
         sample = self._read(draw)
-        return reframe(sample, self._reframing(sample.lens, draw))
+        return sample.through(self._view(sample.lens, draw))
 
-    def _reframing(self, own: Lens, draw: Draw) -> Reframing:
-        """The way to show a picture of the lens `own`."""
+    def _view(self, own: Lens, draw: Draw) -> PixelView:
+        """What a sample shows of a picture of the lens `own`."""
         turn, crop = self._turn(draw), self._crop(draw)
         if self.lens_augmentation is not None:
-            return Warped(own, self._other_lens(draw, own, crop), turn)
+            return CameraView(self._other_lens(draw, own, crop), turn=turn)
         part = taken_part(picture_size(own), self.fit, crop)
-        return Moved(own, part, (self.size, self.size), turn, self._render(part))
+        return CropView(part, (self.size, self.size), turn, render=self._render(part))
 
     def _turn(self, draw: Draw) -> Turn:
         return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else STILL
@@ -157,8 +164,8 @@ class Samples(Dataset):
         """A random part of the pictures."""
         return None
 
-    def _render(self, part: Part) -> tuple[int, int] | None:
-        """`Reframing`'s number of points for a part of a turned picture."""
+    def _render(self, part: Part) -> Pair | None:
+        """`CropView`'s number of points for a part of a turned picture."""
         return None
 
     def _other_lens(self, draw: Draw, own: Lens, crop: Crop | None = None) -> Lens:
@@ -253,7 +260,7 @@ class Calibrated(Samples):
         (picture,) = headers
         self.calibrations.check(self.source.file(index), picture.upright, picture.orientation)
 
-    def _render(self, part: Part) -> tuple[int, int]:
+    def _render(self, part: Part) -> Pair:
         return part[2:]  # a point for each pixel
 
     def _lens_alone(self, draw: Draw) -> Lens:

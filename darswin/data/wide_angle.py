@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from darswin.data.framing import taken_part
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
-from darswin.data.reframing import Reframing, Warped, reframe
 from darswin.data.sample import Sample
 from darswin.data.samples import Draw, Samples
-from darswin.data.warping import area_resized, taken_part
 from darswin.lens import Lens, Perspective
 from darswin.utils.angles import degrees_hint
+from darswin.utils.resize import area_resized
 from darswin.utils.tasks import Fit
+from darswin.views import CameraView, CropView, PixelView
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
@@ -70,27 +71,25 @@ class WideAngle(Samples):
         picture, label = self.source[draw.picture]
         picture = self._square(picture)
         sample = Sample(picture, label, _view(self.fov, len(picture)))
-        if self.lens_augmentation is None:
-            return sample
-        # Another camera sees a picture of the first one.
-        large = self._first_lens(draw).resized((self.render, self.render))
-        return reframe(sample, Warped(sample.lens, large, self._turn(draw), (self.render,) * 2))
-
-    def _reframing(self, own: Lens, draw: Draw) -> Reframing:
-        if self.lens_augmentation is not None:
-            return Warped(own, self._other_lens(draw, own))
         # A turn leaves the lens as it is, which is round and in the middle.
-        return Warped(own, self._first_lens(draw), self._turn(draw), (self.render,) * 2)
+        return sample.through(CameraView(self._first_lens(draw), turn=self._turn(draw), reads=1))
+
+    def _view(self, own: Lens, draw: Draw) -> PixelView:
+        if self.lens_augmentation is not None:
+            return CameraView(self._other_lens(draw, own))
+        return CropView((0, 0, self.render, self.render), (self.size, self.size))
 
     def _taken(self, index: int) -> tuple[tuple[int, int], None]:
         height, width = self.source[index][0].shape[:2]
         return (height, width), None
 
     def _lens_alone(self, draw: Draw) -> Lens:
-        return _view(self.fov, self.size)
+        return self._first_lens(draw)
 
     def _first_lens(self, draw: Draw) -> Lens:
-        return self._drawn(self.lenses, draw, 1, self.fov, None)
+        """The lens of a picture of `render` px."""
+        lens = self._drawn(self.lenses, draw, 1, self.fov, None)
+        return lens.resized((self.render, self.render))
 
     def _square(self, picture: np.ndarray) -> np.ndarray:
         top, left, height, width = taken_part(picture.shape[:2], self.fit)

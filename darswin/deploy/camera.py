@@ -173,7 +173,7 @@ def _reading(sample: nn.Module, lens: Lens | None, size: Pair, *, exact: bool = 
     if isinstance(view, PolarView):
         return _Reading(points, view.layout, view.samples, channels, view.mean, view.std)
     assert isinstance(points, Tensor)
-    reads = view.reads_of(size) if isinstance(view, PixelView) else 1
+    reads = points.shape[2] // view.size[1] if isinstance(view, PixelView) and view.size else 1
     return _Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)
 
 

@@ -61,6 +61,11 @@ class Frames(Protocol):
     ) -> tuple[np.ndarray, ...]:
         """The places of the points of a polar grid: columns, rows, right, lower."""
 
+    @staticmethod
+    def read(picture: np.ndarray, points: np.ndarray, reads: int, /) -> np.ndarray:
+        """A picture (H, W, C) of uint8 or float32 at points (k·H', k·W', 2): (H', W', C), each the
+        mean of k² points, with 0 outside."""
+
 
 try:
     if (found := find_spec("darswin.frames._frames")) and found.origin:

@@ -16,6 +16,12 @@ from darswin.ops.checks import tensor_there
 OUTSIDE = -10.0  # px: beyond any image, also for interpolation over several pixels
 
 
+def pixel_grid(size: tuple[int, int], like: Tensor) -> Tensor:
+    """The pixels (x, y) of (H, W), (1, H, W, 2), with the dtype and the device of `like`."""
+    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
+
+
 def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The rays that land on the pixels' centres. Differentiable in the lens.
 
@@ -25,10 +31,7 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     Returns:
         θ (N, H, W), rad, NaN where no ray lands or beyond θ_max; and (cos φ, sin φ), (N, H, W, 2).
     """
-    like = lens.theta_max
-    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-    theta, direction = lens.theta_and_direction(pixels[None], size)
+    theta, direction = lens.theta_and_direction(pixel_grid(size, lens.theta_max), size)
     return torch.where(lens.sees(theta), theta, torch.nan), direction
 
 

@@ -7,13 +7,15 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
+from darswin.lens import Lens
 from darswin.lens.spacing import Spacing
 from darswin.models.base import Model
 from darswin.models.detections import detections_to_images, find_detections
 from darswin.ops.checks import as_int
-from darswin.views import Prepared, View, make_view
+from darswin.views import PixelView, Prepared, View, make_view
 from darswin.views.base import Pair, PerChannel
 from darswin.views.directions import Vector
+from darswin.views.remap import Remaps
 
 
 class LensAdapter(Model[Any]):
@@ -99,9 +101,14 @@ class LensAdapter(Model[Any]):
             self.view = make_view(view, _pair(size), mean=mean, std=std, **options)
         self.network, self.output, self.boxes = network, output, boxes
         self.goes_back = output == "pixels"
-        self.reads_rays = self.goes_back and self.view.uses_lens  # detections come with rays
         if self.mean is None:
             self._looks = 0  # the network may expect any values
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        prepared = super().prepare(lens, size)
+        if isinstance(self.view, PixelView) and not torch.compiler.is_compiling():
+            prepared = prepared._replace(remaps=Remaps(self.view, lens, size))
+        return prepared
 
     def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
         results = self.network(x)

@@ -3,15 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from darswin import boxes as of_boxes
-from darswin.lens.pixels import OUTSIDE
-from darswin.utils.tables import read_table
-from darswin.views import PolarGrid, Prepared, View
+from darswin.views import PolarGrid, Prepared, Remap, View
 
 NAMES = ("boxes", "scores", "labels")
 
@@ -59,31 +55,26 @@ def detections_to_images(
         For each image, the same dicts. The boxes are those of what the image shows of the ellipses
         inside them, and those of several tiles are merged, the best first. "visible" (K,) is the
         share of the area of each ellipse that the image shows, and boxes that it does not show are
-        left out. "rays" (K, 3) are the
-        directions of the middles in the camera's frame, unless the view ignores the lens. Masks
-        are resampled to the image. Keypoints that the image does not show are NaN.
+        left out. "rays" (K, 3) are the directions of the middles of the boxes of the view, in the
+        camera's frame, unless the view ignores the lens. Masks are resampled to the
+        image. Keypoints that the image does not show are NaN.
 
     Raises:
         ValueError: boxes, scores and labels do not fit together, the view is polar, or there are
             masks of tiles.
     """
-    images = [found[k : k + view.count] for k in range(0, len(found), view.count)]
     if isinstance(prepared.points, PolarGrid):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
-    points = _tables(_landing(prepared), view.count)
-    rays = _tables(None if prepared.rays is None else prepared.rays.movedim(1, -1), view.count)
+    if prepared.remaps is None:
+        raise ValueError("detections cannot come back inside a graph: compile the network alone")
     results = []
-    for k, tiles in enumerate(images):
-        own_points, own_rays = (of[min(k, len(of) - 1)] for of in (points, rays))
-        carried = [
-            _carried(part, prepared.size, own_points[tile], own_rays[tile])
-            for tile, part in enumerate(tiles)
-        ]
+    for k in range(len(found) // view.count):
+        remap = prepared.remaps[min(k, len(prepared.remaps) - 1)]
+        tiles = found[k * view.count : (k + 1) * view.count]
+        carried = [_carried(part, tile) for part, tile in zip(tiles, remap.tiles, strict=True)]
         joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
         if "masks" in joined:
             joined["masks"] = _masks_in_image(joined["masks"], view, prepared, k)
-        if prepared.points is None:  # the picture is the image
-            joined["boxes"] = of_boxes.clip(joined["boxes"], prepared.size)
         seen = joined["visible"] > 0
         joined = {name: value[seen] for name, value in joined.items()}
         if view.count > 1:
@@ -107,63 +98,22 @@ def _masks_in_image(masks: Tensor, view: View, prepared: Prepared, image: int) -
     return in_image.view(*masks.shape[:-2], height, width)
 
 
-def _landing(prepared: Prepared) -> Tensor | None:
-    """The points at which a view reads the images, also beside them; NaN where no ray lands."""
-    if prepared.points is None:
-        return None
-    assert isinstance(prepared.points, Tensor)
-    return torch.where(prepared.points == OUTSIDE, torch.nan, prepared.points)
-
-
-def _tables(values: Tensor | None, count: int) -> Any:
-    """Values of the pixels of n tiles below each other, (N, n·H', W', K), as N × n arrays (H', W',
-    K); None if the view is the image."""
-    if values is None:
-        return [[None] * count]
-    return values.detach().double().cpu().unflatten(1, (count, -1)).numpy()
-
-
-def _carried(
-    found: Mapping[str, Tensor],
-    size: tuple[int, int],
-    points: np.ndarray | None,
-    rays: np.ndarray | None,
-) -> dict[str, Tensor]:
-    """The detections of one picture whose pixels show points (k·H', k·W', 2) of the image (H, W)
-    along rays (H', W', 3)."""
+def _carried(found: Mapping[str, Tensor], remap: Remap) -> dict[str, Tensor]:
+    """The detections of one picture in the pixels of the image."""
     boxes, scores = found["boxes"], found["scores"]
     count = len(boxes)
     if boxes.shape != (count, 4) or scores.shape != (count,) or found["labels"].shape != (count,):
         shapes = ", ".join(f"{name} {tuple(found[name].shape)}" for name in NAMES)
         raise ValueError(f"detections must be boxes (K, 4), scores (K,), labels (K,), got {shapes}")
-    if not boxes.is_floating_point():
-        boxes = boxes.float()
     kept = {
         name: value for name, value in found.items()
         if isinstance(value, Tensor) and value.dim() and len(value) == count
     }  # fmt: skip
-    if points is None:  # the picture is the image
-        whole = boxes.isfinite().all(1).to(boxes)
-        return kept | dict(boxes=boxes, visible=whole)
-    assert rays is not None
-    height, width = rays.shape[:2]
-    reads = points.shape[0] // height
-    boxes = of_boxes.clip(boxes, (height, width))
-    outside = (boxes[:, 2:] <= boxes[:, :2]).any(1, keepdim=True)
-    boxes = torch.where(outside, torch.nan, boxes)
-
-    def to_image(pixels: np.ndarray) -> np.ndarray:
-        return read_table(points, (pixels + 0.5) * reads - 0.5)
-
-    carried, visible = of_boxes.carry(boxes, to_image, size)
-    moved = dict(boxes=carried, visible=visible)
+    moved = remap.boxes_to_image(boxes)
+    kept |= dict(boxes=moved.boxes, visible=moved.visible)
+    if remap.view.uses_lens:
+        kept["rays"] = moved.rays
     if "keypoints" in kept:
-        places = of_boxes.carry_points(kept["keypoints"][..., :2], to_image)
-        sides = places.new_tensor(size[::-1])
-        outside = ((places < 0) | (places > sides)).any(-1, keepdim=True)
-        places = torch.where(outside, torch.nan, places)
-        moved["keypoints"] = torch.cat((places, kept["keypoints"][..., 2:]), -1)
-    middle = boxes.detach().double().cpu().unflatten(1, (2, 2)).mean(1).numpy() - 0.5
-    inside = np.clip(middle, 0, [width - 1, height - 1])
-    ray = torch.from_numpy(read_table(rays, inside)).to(boxes)
-    return kept | moved | dict(rays=F.normalize(ray, dim=1))
+        places = of_boxes.carry_points(kept["keypoints"][..., :2], remap.to_image)
+        kept["keypoints"] = torch.cat((places, kept["keypoints"][..., 2:]), -1)
+    return kept

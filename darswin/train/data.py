@@ -13,14 +13,14 @@ from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
+from darswin.data.framing import CutOff
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
-from darswin.data.reframing import RandomTurns
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
-from darswin.data.warping import CutOff
+from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals

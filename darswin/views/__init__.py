@@ -6,6 +6,8 @@ from darswin.views.base import (
     Prepared,
     View,
 )
+from darswin.views.camera import CameraView
+from darswin.views.crop import CropView
 from darswin.views.cylindrical import CylindricalView
 from darswin.views.directions import RayView, turned, up_of
 from darswin.views.equirectangular import EquirectangularView
@@ -16,12 +18,16 @@ from darswin.views.pixels import PixelView
 from darswin.views.plain import PlainView
 from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.registry import list_views, make_view, register_view
+from darswin.views.remap import Remap
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
 from darswin.views.tangent import TangentView
 from darswin.views.tiles import TilesView
+from darswin.views.turn import Turn
 
 __all__ = [
+    "CameraView",
+    "CropView",
     "CylindricalView",
     "EquirectangularView",
     "MercatorView",
@@ -35,10 +41,12 @@ __all__ = [
     "PolarView",
     "Prepared",
     "RayView",
+    "Remap",
     "SquareView",
     "StereographicView",
     "TangentView",
     "TilesView",
+    "Turn",
     "View",
     "list_views",
     "make_view",

@@ -85,6 +85,7 @@ class Prepared(NamedTuple):
       network has no answer. None means all pixels, or that the way back was not asked for.
     - `around`: (N or 1,), True if the view goes all around, so that its first column follows its
       last. None means that none does.
+    - `remaps`: the `Remap` of each lens, by which detections come back; None without detections.
     """
 
     size: Pair
@@ -95,6 +96,7 @@ class Prepared(NamedTuple):
     tables: Sequence[Sequence[Tensor]] = ()
     shown: Tensor | None = None
     around: Tensor | None = None
+    remaps: Sequence[Any] | None = None
 
 
 class View(nn.Module):

@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map, ray_channels
+from darswin.lens.pixels import as_map, pixel_grid, ray_channels
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
 from darswin.utils.angles import check_turn, degrees_hint
 from darswin.utils.arrays import as_tensor
-from darswin.views.base import Pair, PerChannel, Prepared, check_lens
+from darswin.views.base import Pair, PerChannel, check_lens
 from darswin.views.pixels import PixelView
 
 Vector = Sequence[float] | Tensor
@@ -93,8 +93,7 @@ class RayView(PixelView):
         self._known: tuple[Tensor, Tensor] | None = None
 
     def for_lens(self, lens: Lens, size: Pair) -> Self:
-        """The same view of lenses like this one alone: it finds once what it covers of them, which
-        takes most of the time of `to_view`. size: (H, W) of the images."""
+        # What the view covers takes most of the time of `to_view`.
         view = copy.copy(self)
         view._known = self._layout(lens, size)
         return view
@@ -142,14 +141,15 @@ class RayView(PixelView):
         return check_sees(self.read_points(lens, size), self, lens, size)
 
     def read_points(self, lens: Lens, size: Pair) -> Tensor:
-        """`image_points` of a view that may see nothing of the lens: for each pixel, the points at
-        which it reads the image, (N, k·H', k·W', 2)."""
-        return as_map(self.place(lens, self._rays(lens, size, self.reads_of(size)), size))
+        """`image_points` of a view that may see nothing of the lens."""
+        return as_map(self.to_image(self._finely(lens, size), lens, size))
 
-    def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        grid = pixel_grid(size, lens.theta_max)
-        rays = lens.unproject_points(grid, size)
-        return as_map(self._points(rays, self._shows(rays), lens, size))
+    def to_image(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return self.place(lens, self.to_rays(points, lens, size), size)
+
+    def to_view(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        rays = lens.unproject_points(points, size)
+        return self._points(rays, self._shows(rays), lens, size)
 
     def goes_around(self, lens: Lens, size: Pair) -> Tensor | None:
         if not self.upright:
@@ -158,26 +158,16 @@ class RayView(PixelView):
         return around if not readable(around) or around.any() else None
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
-        rays = self._rays(lens, size)
+        rays = self.to_rays(pixel_grid(self.size, lens.theta_max), lens, size)
         aside = length_of(rays[..., :2])
         theta = torch.atan2(aside, rays[..., 2])
         shown = lens.sees(theta) & self._shows(rays)
         return torch.where(shown, theta, torch.nan), rays[..., :2] / aside[..., None]
 
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
-        reads = self.reads_of(prepared.size)
-        seen = super().see(images, prepared, dtype)
-        return seen if reads == 1 else F.avg_pool2d(seen, reads)
-
     def rays(self, lens: Lens, size: Pair) -> Tensor:
         """The rays of the pixels, unit vectors (N, H', W', 3) in the camera's frame; 0 where the
         lens or the view sees nothing. size: (H, W) of the images."""
         return ray_channels(*self.pixel_rays(check_lens(lens, size), size)).movedim(1, -1)
-
-    def _rays(self, lens: Lens, size: Pair, reads: int = 1) -> Tensor:
-        height, width = self.size
-        grid = pixel_grid((height * reads, width * reads), lens.theta_max)
-        return self.to_rays((grid + 0.5) / reads - 0.5, lens, size)
 
     def place(self, lens: Lens, rays: Tensor, size: Pair) -> Tensor:
         """The pixels of images of (H, W) at which rays land; NaN where the view shows nothing."""
@@ -190,7 +180,7 @@ class RayView(PixelView):
         least = -1.0 if self.theta_max is None else math.cos(self.theta_max)
         return rays[..., 2] >= least - 1e-6
 
-    def reads_of(self, size: Pair) -> int:
+    def reads_of(self, lens: Lens, size: Pair) -> int:
         # It must not depend on the values of a lens, which a compiled graph does not have.
         if self.reads is not None:
             return self.reads
@@ -297,12 +287,6 @@ def check_sees(points: Tensor, view: PixelView, lens: Lens, size: Pair) -> Tenso
         if not inside.all(-1).any():
             raise ValueError(f"this view sees nothing of the lens: {view} of {lens}")
     return points
-
-
-def pixel_grid(size: Pair, like: Tensor) -> Tensor:
-    """The pixels (x, y) of (H, W), (1, H, W, 2), with the dtype and the device of `like`."""
-    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
-    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
 
 
 def unit_vector(name: str, vector: Vector) -> tuple[float, float, float]:

@@ -1,7 +1,7 @@
 """The views that a network sees as pixels, and the way from their pixels back to the images."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -9,9 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import OUTSIDE, ray_channels, sample_at
+from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, ray_channels, sample_at
 from darswin.ops.checks import check_pair, tensor_there
-from darswin.utils.arrays import as_tensor
 from darswin.views.base import (
     Pair,
     PerChannel,
@@ -22,18 +21,25 @@ from darswin.views.base import (
     check_seen_images,
     in_full_precision,
 )
-
-Points = TypeVar("Points", np.ndarray, Tensor)
+from darswin.views.remap import Remap
+from darswin.views.turn import STILL
 
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a view is on it
 
 
 class PixelView(View):
-    """A view whose pixels are pixels of the images. A subclass says which: three maps of points.
+    """A view whose pixels are pixels of the images. A subclass says which, by rays or by points.
 
     Args:
         size: (H', W') of the view; None for the size of the images, if the view ignores its lens.
+
+    Attributes:
+        turn: of the view relative to the picture.
+        tiles: the views of which this one consists, if there are several.
     """
+
+    turn = STILL
+    tiles: Sequence["PixelView"] = ()
 
     def __init__(
         self, size: Pair | None, *, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0
@@ -43,21 +49,9 @@ class PixelView(View):
             size = check_pair("size", size, 1)
         self.size = size
 
-    def image_points(self, lens: Any, size: Pair) -> Tensor | None:
-        """The points of images of (H, W) that the pixels of the view show, (N, H', W', 2) px."""
-        raise NotImplementedError
-
-    def view_points(self, lens: Any, size: Pair) -> Tensor | None:
-        """The points of the view that the pixels of images of (H, W) show, (N, H, W, 2) px."""
-        raise NotImplementedError
-
-    def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
-        """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
-        raise NotImplementedError
-
-    def reads_of(self, size: Pair) -> int:
-        """The points along each side of a pixel at which images of (H, W) are read."""
-        return 1
+    def at(self, lens: Lens | None, size: Pair) -> Remap:
+        """The map between this view and pictures of (H, W) of one lens. See `Remap`."""
+        return Remap(self, lens, size)
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN
@@ -68,31 +62,66 @@ class PixelView(View):
         """The inverse of `to_rays`: pixels (N, ..., 2) of the view, which may be outside of it."""
         raise NotImplementedError
 
-    def to_image(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
-        """Pixels (..., 2) of the view → pixels (..., 2) of images of (H, W), exactly.
+    def to_image(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
+        """Pixels (N or 1, ..., 2) of the view → pixels (N, ..., 2) of images of (H, W), also beyond
+        their edges; NaN where the view shows nothing. `Remap` has this for arrays, in float64."""
+        return lens.project_points(self.to_rays(points, lens, size), size)
 
-        Args:
-            points: x and y, a NumPy array or a tensor; computed in float64.
-            lens: one lens. size: (H, W) of its images.
-            of_tile: `tile=k`, the number of the tile, if the view has tiles.
+    def to_view(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
+        """The inverse of `to_image`: pixels (N, ..., 2), also beyond the edges of the view."""
+        return self.to_points(lens.unproject_points(points, size), lens, size)
 
-        Returns:
-            Points as given; NaN where the image shows nothing: no ray lands, or it is outside.
-        """
+    def image_points(self, lens: Any, size: Pair) -> Tensor | None:
+        """The points of images of (H, W) at which the pixels of the view are read, k² for each,
+        (N, k·H', k·W', 2) px. None means that the view is the images."""
+        return as_map(self.to_image(self._finely(lens, size), lens, size))
 
-        def move(pixels: Tensor, exact: Lens) -> Tensor:
-            places = exact.project_points(self.to_rays(pixels, exact, size, **of_tile), size)
-            sides = tensor_there(size[::-1], places)
-            beyond = (places + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
-            return torch.where(beyond.any(-1, keepdim=True), torch.nan, places)
+    def view_points(self, lens: Any, size: Pair) -> Tensor | None:
+        """The points of the view that the pixels of images of (H, W) show, (N, H, W, 2) px."""
+        return as_map(self.to_view(pixel_grid(size, lens.theta_max), lens, size))
 
-        return _exactly(points, lens, size, move)
+    def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
+        """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
+        raise NotImplementedError
 
-    def to_view(self, points: Points, lens: Lens, size: Pair, **of_tile: int) -> Points:
-        """Pixels (..., 2) of images of (H, W) → pixels (..., 2) of the view: the inverse of
-        `to_image`, with its arguments."""
-        return _exactly(points, lens, size, lambda pixels, exact: self.to_points(
-            exact.unproject_points(pixels, size), exact, size, **of_tile))  # fmt: skip
+    def reads_of(self, lens: Any, size: Pair) -> int:
+        """k, the points along each side of a pixel at which images of (H, W) are read."""
+        return 1
+
+    def _finely(self, lens: Any, size: Pair) -> Tensor:
+        """k² points in each pixel of the view, (1, k·H', k·W', 2)."""
+        assert self.size is not None
+        reads, (height, width) = self.reads_of(lens, size), self.size
+        grid = pixel_grid((height * reads, width * reads), lens.theta_max)
+        return grid if reads == 1 else (grid + 0.5) / reads - 0.5
+
+    # -- of one lens: what `Remap` asks for -----------------------------------------------------
+
+    def for_lens(self, lens: Lens, size: Pair) -> Self:
+        """The same view of this lens alone, which finds once what it covers."""
+        return self
+
+    def camera(self, lens: Any, size: Pair) -> Lens | None:
+        """The lens of the view's picture, if a camera could have taken it."""
+        return None
+
+    def picture(self, picture: np.ndarray, remap: Remap) -> np.ndarray:
+        """`Remap.__call__` of an array."""
+        return remap.sampled(picture)
+
+    def points_read(self, lens: Any, size: Pair) -> np.ndarray:
+        """`image_points` of one lens, (k·H', k·W', 2)."""
+        points = self.image_points(lens, size)
+        assert points is not None
+        return points[0].numpy()
+
+    def points_of_target(self, lens: Any, size: Pair) -> np.ndarray:
+        """The points of the image whose labels the pixels of the view take, (H', W', 2); NaN
+        where it shows nothing."""
+        shape = self.size or size
+        return self.to_image(exact_grid(shape), lens, size)[0].numpy()
+
+    # -- of N lenses ----------------------------------------------------------------------------
 
     @in_full_precision
     def prepare(
@@ -138,7 +167,10 @@ class PixelView(View):
             return images
         assert isinstance(prepared.points, Tensor)
         check_count(prepared.points.shape[0], images)
-        return sample_at(images, prepared.points)
+        seen = sample_at(images, prepared.points)
+        assert self.size is not None
+        reads = prepared.points.shape[2] // self.size[1]
+        return seen if reads == 1 else F.avg_pool2d(seen, reads)
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
         points = self.back_points(prepared, (maps.shape[2], maps.shape[3]))
@@ -181,21 +213,9 @@ class PixelView(View):
         return f"size={self.size}"
 
 
-def _exactly(
-    points: Points, lens: Lens, size: Pair, move: Callable[[Tensor, Lens], Tensor]
-) -> Points:
-    """Moves points (..., 2) through one lens of images of (H, W) in float64."""
-    if len(check_lens(lens, size)) != 1:
-        raise ValueError(f"points move through one lens, got {len(lens)}")
-    if (shape := tuple(np.shape(points)))[-1:] != (2,):
-        raise ValueError(f"points must have shape (..., 2), got {shape}")
-    if not isinstance(points, Tensor):
-        places = np.asarray(points)
-        exact = as_tensor(places, torch.float64)
-        moved = move(exact[None], lens.detach().to("cpu", torch.float64))[0]
-        return moved.numpy().astype(np.result_type(places, np.float32), copy=False)
-    moved = move(points[None].to(torch.float64), lens.to(points.device, torch.float64))[0]
-    return moved.to(torch.promote_types(points.dtype, torch.float32))
+def exact_grid(size: Pair) -> Tensor:
+    """The pixels of (H, W), (1, H, W, 2) float64."""
+    return pixel_grid(size, torch.zeros((), dtype=torch.float64))
 
 
 def _centers(size: Pair, device: torch.device | None) -> Tensor:

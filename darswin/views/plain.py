@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from darswin.lens import Lens, pixels
 from darswin.views.base import Pair, Prepared
-from darswin.views.pixels import PixelView, resized
+from darswin.views.pixels import PixelView, exact_grid, resized
 from darswin.views.registry import register_view
 
 
@@ -35,6 +36,15 @@ class PlainView(PixelView):
 
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         return lens.project_points(rays, size)
+
+    def to_image(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
+        return points
+
+    def to_view(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
+        return points
+
+    def points_read(self, lens: Any, size: Pair) -> np.ndarray:
+        return exact_grid(size)[0].numpy()
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
         return resized(maps, prepared.size)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import OUTSIDE, sample_at
+from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, sample_at
 from darswin.lens.solve import direction_of, vector_of
 from darswin.ops.checks import as_int
 from darswin.utils.angles import degrees_hint
@@ -129,8 +129,9 @@ class TilesView(PixelView):
         best = torch.full((1,), -0.5)
         found = torch.full((1, 2), OUTSIDE)
         best, found = best.to(lens.theta_max), found.to(lens.theta_max)
+        grid = pixel_grid(size, lens.theta_max)
         for k, tile in enumerate(self.tiles):
-            x, y = tile.view_points(lens, size).unbind(-1)
+            x, y = as_map(tile.to_view(grid, lens, size)).unbind(-1)
             margin = torch.stack((x, width - 1 - x, y, height - 1 - y)).amin(0)
             inner = margin > best
             best = torch.where(inner, margin, best)
@@ -143,8 +144,8 @@ class TilesView(PixelView):
         theta, direction = zip(*(tile.pixel_rays(lens, size) for tile in self.tiles), strict=True)
         return torch.cat(theta, 1), torch.cat(direction, 1)
 
-    def reads_of(self, size: Pair) -> int:
-        return self.tiles[0].reads_of(size)
+    def reads_of(self, lens: Lens, size: Pair) -> int:
+        return self.tiles[0].reads_of(lens, size)
 
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
         seen = self.tiles[0].see(images, prepared, dtype)
@@ -170,14 +171,6 @@ class TilesView(PixelView):
         assert isinstance(prepared.points, Tensor)
         check_count(prepared.points.shape[0], seen[:: self.count])
         return seen
-
-    def to_rays(self, points: Tensor, lens: Lens, size: Pair, tile: int = 0) -> Tensor:
-        """`RayView.to_rays` of one tile."""
-        return self.tiles[tile].to_rays(points, lens, size)
-
-    def to_points(self, rays: Tensor, lens: Lens, size: Pair, tile: int = 0) -> Tensor:
-        """`RayView.to_points` of one tile."""
-        return self.tiles[tile].to_points(rays, lens, size)
 
     def rays(self, lens: Lens, size: Pair) -> Tensor:
         """The rays of the pixels of the tiles, unit vectors (N, n, H', W', 3); see `RayView`."""

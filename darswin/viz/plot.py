@@ -33,7 +33,6 @@ from darswin.utils.arrays import as_tensor
 from darswin.utils.files import replace_file
 from darswin.views import PixelView, PolarGrid, PolarView
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
-from darswin.viz.views import undistort, view_map
 
 __all__ = ["draw_lens", "save_figure"]
 
@@ -189,20 +188,21 @@ def draw_view(image: np.ndarray, lens: Lens, view: PixelView, *, axes: Axes) -> 
     if view.count != 1:
         raise ValueError(f"a figure shows a view of one picture, got {view.count}")
     lens, size = _one(lens), (image.shape[0], image.shape[1])
-    points, reads = view_map(lens, view, size), view.reads_of(size)
-    height, width = points.shape[0] // reads, points.shape[1] // reads
+    remap = view.at(lens, size)
+    points, (height, width) = remap.points, remap.view_size
+    reads = points.shape[1] // width
     beyond = (points == OUTSIDE).all(-1)
     outside = beyond | ((points < -0.5) | (points > (size[1] - 0.5, size[0] - 0.5))).any(-1)
     # A pixel is hatched if all of its points are.
     beyond, outside = (
         x.reshape(height, reads, width, reads).all((1, 3)) for x in (beyond, outside)
     )
-    _show(axes, undistort(image, lens, view), outside)
+    _show(axes, remap(image), outside)
     x, y = torch.arange(width), torch.arange(height)
     row = torch.stack((x, torch.full((width,), (height - 1) / 2)), -1)
     column = torch.stack((torch.full((height,), (width - 1) / 2), y), -1)
     for axis, pixels, sign in ((axes.xaxis, row, 1), (axes.yaxis, column, -1)):
-        rays = view.to_rays(pixels[None].to(torch.float64), lens, size)[0]
+        rays = remap.rays(pixels.to(torch.float64))
         most = max(2, 5 * len(rays) // max(height, width))
         positions, degrees = _angle_ticks(F.normalize(rays, dim=-1), most)
         axis.set_ticks(positions, [f"{sign * angle + 0:g}°" for angle in degrees])

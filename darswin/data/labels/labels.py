@@ -3,15 +3,16 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from darswin.boxes import carry_points, decode_rle, encode_rle
+from darswin.boxes import carry, carry_points, decode_rle, encode_rle
 from darswin.boxes.carried import cut_polygon, ellipses
 from darswin.boxes.regions import NO_AREA, Part, area_of, box_of, shown_parts
 from darswin.data.cameras import Calibrations
 from darswin.utils.image import read_header
+from darswin.views import Remap
 
 Size = tuple[int, int]
 
@@ -60,7 +61,7 @@ class Thing:
 
 
 class Labels(NamedTuple):
-    """The things in one picture: a target for `darswin.data.Sample`, which `reframe` moves.
+    """The things in one picture: a target for `darswin.data.Sample`, which `Sample.through` moves.
 
     Attributes: things; size: (H, W) of the picture; lost: the number of things that have left the
     picture, because less than `LEAST_VISIBLE` of them, a fifth, is visible.
@@ -71,53 +72,50 @@ class Labels(NamedTuple):
     lost: int = 0
 
 
-class Move(Protocol):
-    """A picture that becomes another one, such as a `darswin.data.Reframing`."""
-
-    size: Size
-
-    @property
-    def mirrored(self) -> bool:
-        """Whether left and right are swapped."""
-
-    def to_new(self, points: np.ndarray) -> np.ndarray:
-        """Pixels of the old picture in the new one."""
-
-    def target(self, target: np.ndarray) -> np.ndarray:
-        """A map (H, W), uint8, in the new picture; 255 where nothing is known."""
-
-
-def moved(labels: Labels, move: Move) -> Labels:
-    """The labels of the new picture.
+def moved(labels: Labels, remap: Remap) -> Labels:
+    """The labels of the picture that a view shows.
 
     Polygons, keypoints and masks move exactly, and boxes follow from them. Things of which only the
     box is known move as the ellipse inside it. All are cut at the borders of the new picture, and
     where it shows nothing.
     """
-    found = move_things(labels.things, move)
+    found = move_things(labels.things, remap)
     things = [thing for thing in found if thing.visible >= LEAST_VISIBLE]
-    return Labels(things, move.size, labels.lost + len(found) - len(things))
+    return Labels(things, remap.view_size, labels.lost + len(found) - len(things))
 
 
-def move_things(things: Sequence[Thing], move: Move) -> list[Thing]:
+def move_things(things: Sequence[Thing], remap: Remap) -> list[Thing]:
     """Each of the things in the new picture, with what is visible of it, also if it is nothing."""
     old = [_outlines(thing) for thing in things]
     shown = iter(shown_parts(
         [line for lines in old for line in lines],
-        lambda points: carry_points(points, move.to_new), move.size,
+        lambda points: carry_points(points, remap.to_view), remap.view_size,
     ))  # fmt: skip
+    boxes = np.array([thing.box for thing in things if _is_box(thing)]).reshape(-1, 4)
+    carried = zip(*carry(boxes, remap.to_view, remap.view_size), strict=True)
+
+    def move(thing: Thing, lines: Sequence[np.ndarray]) -> Thing:
+        if thing.rle is not None:
+            return _with_mask(thing, remap)
+        if _is_box(thing):
+            box, seen = next(carried)
+            return replace(thing, box=box, visible=thing.visible * float(seen))
+        return _with_outlines(thing, lines, [next(shown) for _ in lines])
+
     return [
-        _with_keypoints(
-            _with_mask(thing, move) if thing.rle is not None
-            else _with_outlines(thing, lines, [next(shown) for _ in lines]), thing, move,
-        )
+        _with_keypoints(move(thing, lines), thing, remap)
         for thing, lines in zip(things, old, strict=True)
-    ]  # fmt: skip
+    ]
+
+
+def _is_box(thing: Thing) -> bool:
+    """Whether only an upright box is known."""
+    return thing.rle is None and not len(thing.polygons) and not thing.turn
 
 
 def _outlines(thing: Thing) -> list[np.ndarray]:
     """The outlines by which a thing moves, cut finely."""
-    if thing.rle is not None:
+    if thing.rle is not None or _is_box(thing):
         return []
     if len(thing.polygons):
         return [cut_polygon(polygon) for polygon in thing.polygons]
@@ -142,13 +140,13 @@ def _with_outlines(
     )  # fmt: skip
 
 
-def _with_mask(thing: Thing, move: Move) -> Thing:
+def _with_mask(thing: Thing, remap: Remap) -> Thing:
     assert thing.rle is not None
     old = decode_rle(thing.rle)
     pixels = np.argwhere(old)[:: 1 + old.sum() // _SAMPLES, ::-1]
-    inside = _is_inside(move.to_new(pixels.astype(float)) + 0.5, move.size)
+    inside = _is_inside(remap.to_view(pixels.astype(float)) + 0.5, remap.view_size)
     visible = thing.visible * (inside.mean() if len(inside) else 0.0)
-    new = move.target(old.astype(np.uint8)) == 1
+    new = remap.target(old.astype(np.uint8)) == 1
     visible = visible if new.any() else 0.0
     box = box_of_mask(new)
     rle = encode_rle(new, compressed=isinstance(thing.rle["counts"], str))
@@ -163,14 +161,14 @@ def box_of_mask(mask: np.ndarray) -> np.ndarray:
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
 
 
-def _with_keypoints(new: Thing, old: Thing, move: Move) -> Thing:
+def _with_keypoints(new: Thing, old: Thing, remap: Remap) -> Thing:
     """Keypoints (P, 3) move; those that are unknown or outside of the picture are 0, 0, 0."""
     if old.keypoints is None:
         return new
-    places = carry_points(old.keypoints[:, :2], move.to_new)
-    known = (old.keypoints[:, 2] > 0) & _is_inside(places, move.size)
+    places = carry_points(old.keypoints[:, :2], remap.to_view)
+    known = (old.keypoints[:, 2] > 0) & _is_inside(places, remap.view_size)
     there = np.where(known[:, None], np.column_stack((places, old.keypoints[:, 2])), 0.0)
-    mirror = list(old.mirror) if move.mirrored and len(old.mirror) else slice(None)
+    mirror = list(old.mirror) if remap.mirrored and len(old.mirror) else slice(None)
     return replace(new, keypoints=there[mirror])
 
 

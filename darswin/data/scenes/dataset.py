@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from darswin.data.framing import Crop
 from darswin.data.sample import Sample
 from darswin.data.samples import Draw, Samples, as_tensor
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import nothing
-from darswin.data.warping import Crop
 from darswin.lens import Lens
 from darswin.utils.image import Header
 from darswin.utils.parameters import check

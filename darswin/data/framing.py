@@ -1,4 +1,4 @@
-"""The sizes of pictures: through another lens, at a model's size, and back."""
+"""The sizes of pictures: at a model's size, and back."""
 
 import math
 from typing import NamedTuple, get_args
@@ -9,66 +9,27 @@ import torch
 
 from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
-from darswin.lens.pixels import pixel_angles, reprojection
+from darswin.lens.pixels import pixel_angles
 from darswin.utils.parameters import check
 from darswin.utils.tasks import Fit
+from darswin.views import CropView, Remap
+from darswin.views.base import Pair
+from darswin.views.camera import picture_size
+from darswin.views.crop import Part
 
 
-def warp_map(
-    source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
-) -> np.ndarray:
-    """Maps for `cv2.remap`: `darswin.lens.pixels.reprojection` in double precision.
-
-    Returns:
-        (N, H, W, 2) float32, x and y; outside the image for rays beyond either θ_max.
-    """
-    source, target = source.detach().to(torch.float64), target.detach().to(torch.float64)
-    return reprojection(source, source_size, target, size).to(torch.float32).numpy()
-
-
-def remap(
-    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR
-) -> np.ndarray:
-    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; 0 outside it."""
-    image = np.asarray(image, image.dtype.newbyteorder("="))  # else OpenCV misreads it
-    # With x and y in one array the second map is None, which OpenCV's types do not allow.
-    return cv2.remap(image, places, None, interpolation)  # type: ignore[call-overload]
-
-
-def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A picture (H, W, C) at another size (H, W); each pixel is the mean over its area."""
-    height, width = size
-    # An axis that becomes shorter is resized before one that becomes longer. OpenCV averages areas
-    # only if no axis becomes longer. Otherwise it shifts an axis that becomes much shorter by up to
-    # a third of a new pixel.
-    less = min(image.shape[1], width), min(image.shape[0], height)
-    for sides in dict.fromkeys((less, (width, height))):
-        image = cv2.resize(image, sides, interpolation=cv2.INTER_AREA)
-    return image.reshape(height, width, -1)
-
-
-# -- at a model's size ------------------------------------------------------------------------
-
-
-def lens_at_size(lens: Lens, size: int, fit: Fit) -> Lens:
-    """The exact lens of a picture after `at_size`, even if its pixels become oblong.
+def fitted(picture: Pair, size: int, fit: Fit) -> CropView:
+    """The view that gives pictures of (H, W) a model's `size`, px.
 
     Args:
-        lens: the lens, with the image_size of the picture.
+        fit: "crop" cuts the longer side, "stretch" squashes it, and "whole" keeps the aspect ratio
+            and gives the shorter side the size.
+
+    Raises:
+        ValueError: an unknown `fit`.
     """
-    part = taken_part(picture_size(lens), fit)
-    return lens.cropped(*part).resized(size_of_part(part, size, fit))
-
-
-def picture_size(lens: Lens) -> tuple[int, int]:
-    """(H, W) of the pictures of one lens."""
-    if lens.image_size is None:
-        raise ValueError("a lens that follows its picture needs an image_size")
-    height, width = lens.image_size[0].tolist()
-    return round(height), round(width)
-
-
-Part = tuple[int, int, int, int]  # top, left, height, width
+    part = taken_part(picture, fit)
+    return CropView(part, size_of_part(part, size, fit))
 
 
 class Crop(NamedTuple):
@@ -139,7 +100,7 @@ def cut_off(size: tuple[int, int], lens: Lens | None, fit: Fit) -> str | None:
 class FullSize:
     """Brings a network's answers for each pixel back to the size of the pictures of one lens.
 
-    It undoes `at_size`, with bilinear interpolation between those pixels of the network that a ray
+    It undoes `fitted`, with bilinear interpolation between those pixels of the network that a ray
     reaches. Pixels that "crop" cut off, pixels beyond θ_max, and those that the model's view does
     not show, have no label and no distance.
 
@@ -148,25 +109,21 @@ class FullSize:
         reached: (h, w), True for pixels of the network that have an answer.
 
     Args:
-        lens: the lens, with the image_size of the pictures. size, fit: those of `at_size`.
+        remap: `fitted(…).at(lens, (H, W))`, of one lens.
         shown: (1, h, w), the pixels that the model's view shows: `model.prepare(…).shown`. None
             means that it shows all that the lens sees.
-
-    Raises:
-        ValueError: a lens without an image_size, or several; an unknown `fit`.
     """
 
-    def __init__(self, lens: Lens, size: int, fit: Fit, shown: torch.Tensor | None = None):
-        if lens.image_size is None or len(lens) != 1:
-            raise ValueError("FullSize takes one lens, with the image_size of its pictures")
-        top, left, self._height, self._width = taken_part(picture_size(lens), fit)
+    def __init__(self, remap: Remap, shown: torch.Tensor | None = None):
+        assert isinstance(remap.view, CropView) and remap.camera is not None
+        top, left, self._height, self._width = remap.view.part
         self._part = np.s_[top : top + self._height, left : left + self._width]
-        self.reached = _reached(lens_at_size(lens, size, fit))
+        self.reached = _reached(remap.camera)
         near = self._enlarged(self.reached)
         if shown is not None:
             self.reached &= shown.cpu().numpy().reshape(self.reached.shape)
         self._weight = self._enlarged(self.reached)
-        reached = _reached(lens)
+        reached = ~np.isnan(pixel_angles(remap.some_lens, remap.size)[0].numpy())
         self.seen = np.zeros_like(reached)
         # Pixels that the lens sees, and of which the view shows more than a half.
         self.seen[self._part] = reached[self._part] & (self._weight > 0.5 * near)
@@ -207,7 +164,7 @@ class FullSize:
         return self._in_picture(self._weighted(values) / weight, 0)
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
-        """Values (h, w) at the pixels that `at_size` kept, times the share that a ray reaches."""
+        """Values (h, w) at the pixels that `fitted` kept, times the share that a ray reaches."""
         return self._enlarged(np.where(self.reached, values, 0))
 
     def _enlarged(self, values: np.ndarray) -> np.ndarray:

@@ -1,0 +1,188 @@
+"""What another camera at the same place would see: another lens, and a turn about its axis."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from darswin.lens import Lens
+from darswin.lens.pixels import pixel_rays
+from darswin.lens.solve import vector_of
+from darswin.ops.checks import as_int, check_pair, readable
+from darswin.views.base import Pair, PerChannel
+from darswin.views.pixels import PixelView
+from darswin.views.turn import STILL, Turn
+
+_MOST_READS, _APART = 5, 1.5  # points along a pixel, and pixels of the picture between them
+_RADII = 4096  # entries of a table
+_NUDGE = 1e-3  # px, of a radius that is not 0
+_FAR = 1e5  # px, or the multiple of a radius, that leads beyond any picture
+
+
+class CameraView(PixelView):
+    """The picture of another camera at the same place; 0 beyond θ_max of either lens.
+
+    `CameraView(lens, size)(images, own)` resamples images of `own` lenses as `lens` would see
+    them. Gradients go to the images and to both lenses.
+
+    Args:
+        lens: of the other camera, one lens or one for each image.
+        size: (H', W') of its pictures; None means its image_size.
+        turn: about the optical axis; the other lens stays as it is.
+        reads: the points along each side of a pixel at which the image is read, 1 to 16. None means
+            an odd number up to 5 that suits the radii of the lenses.
+        mean, std: the arguments of `View`.
+
+    Raises:
+        ValueError: the size is missing, or a number is out of range.
+    """
+
+    size: Pair
+
+    def __init__(
+        self,
+        lens: Lens,
+        size: Pair | None = None,
+        turn: Turn = STILL,
+        *,
+        reads: int | None = None,
+        mean: PerChannel | None = 0.0,
+        std: PerChannel | None = 1.0,
+    ):
+        size = picture_size(lens) if size is None else check_pair("size", size, 1)
+        super().__init__(size, mean=mean, std=std)
+        if reads is not None and not 1 <= (as_int(reads) or 0) <= 16:
+            raise ValueError(f"reads must be an int from 1 to 16, got {reads!r}")
+        self.lens, self.turn, self.reads = lens, turn, reads
+
+    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return vector_of(*self._seen(self._like(lens), points))
+
+    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
+        matrix = self._matrix(rays)
+        flat = torch.cat((rays[..., :2] @ matrix.T, rays[..., 2:]), -1)
+        return self._like(lens).project_points(flat, self.size)
+
+    def to_image(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        return lens.seen_pixels(*self._seen(self._like(lens), points), size)
+
+    def to_view(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
+        theta, direction = lens.theta_and_direction(points, size)
+        theta = torch.where(lens.sees(theta), theta, torch.nan)
+        return self._like(lens).seen_pixels(theta, direction @ self._matrix(theta).T, self.size)
+
+    def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        theta, direction = pixel_rays(self._like(lens), self.size)
+        theta = torch.where(lens.sees(theta), theta, torch.nan)
+        return theta, direction @ self._matrix(theta)
+
+    def camera(self, lens: Lens, size: Pair) -> Lens:
+        return self.lens
+
+    def reads_of(self, lens: Lens, size: Pair) -> int:
+        if self.reads is not None:
+            return self.reads
+        if not readable(lens.theta_max):
+            raise ValueError("a graph does not know the lens: give the CameraView `reads`")
+        return points_along((lens.r_max / self.lens.r_max.to(lens.theta_max)).max().item())
+
+    def _seen(self, own: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
+        """θ, NaN where no ray lands, and (cos φ, sin φ) in the frame of the images."""
+        theta, direction = own.theta_and_direction(points, self.size)
+        theta = torch.where(own.sees(theta), theta, torch.nan)
+        return theta, direction @ self._matrix(theta)
+
+    def _like(self, lens: Lens) -> Lens:
+        return self.lens.to(lens.theta_max.device, lens.theta_max.dtype)
+
+    def _matrix(self, like: Tensor) -> Tensor:
+        return torch.from_numpy(self.turn.matrix).to(like.device, like.dtype)
+
+    # -- of one lens ----------------------------------------------------------------------------
+
+    def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
+        if not self.lens.is_radial:
+            return super().points_read(lens, size)
+        reads = self.reads_of(lens, size)
+        return self._points(lens, size, *(centres(side, reads * side) for side in self.size))
+
+    def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
+        if not self.lens.is_radial:
+            return super().points_of_target(lens, size)
+        return self._points(lens, size, *map(np.arange, self.size))
+
+    def _points(self, lens: Lens, size: Pair, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """`to_image` of the pixels at y (H,) and x (W,) of a radial lens, (H, W, 2) float32, far
+        outside for NaN: by tables along the radius, because a picture has many more radii."""
+        last, ratios, angles = self._curves(lens)
+        u, v = flat_points(self.lens, self.size, y, x, self.turn.matrix.T)
+        radius = np.sqrt(u * u + v * v)
+        share = radius * ((_RADII - 1) / last)
+        whole = np.floor(share)
+        share -= whole
+        index = whole.astype(np.intp)
+
+        def at(table: np.ndarray) -> np.ndarray:
+            return table[0].take(index, mode="clip") + table[1].take(index, mode="clip") * share
+
+        ratio, offset = at(ratios), np.zeros((2, 1, 1), np.float32)
+        if angles is not None:
+            ray = np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None]
+            rays = torch.from_numpy(at(angles))[None], torch.from_numpy(ray)[None]
+            offset = np.moveaxis(lens.to(torch.float32).offset(*rays)[0].numpy(), -1, 0)
+        u, v = u * ratio + offset[0], v * ratio + offset[1]
+        if lens.affine is not None:
+            u, v = (a * u + b * v for a, b in lens.affine[0].tolist())
+        cx, cy = lens.center_in(size)[0].tolist()
+        return np.stack((u + np.float32(cx), v + np.float32(cy)), -1)
+
+    def _curves(self, own: Lens) -> tuple[float, np.ndarray, np.ndarray | None]:
+        """The radius of the last ray that both lenses see in the new picture; and at equally spaced
+        radii up to it, the radius in the old picture as a multiple, and θ if the old lens is not
+        radial: values and the steps between them, (2, K). Radii beyond lead outside."""
+        new_lens = self._like(own)
+        theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None]
+        theta = theta * torch.minimum(own.theta_max, new_lens.theta_max)
+        new, old = (lens.project(theta)[0].detach().numpy() for lens in (new_lens, own))
+        radii = np.linspace(0, new[-1], _RADII)
+        ratios = np.interp(radii, new, old)
+        ratios[1:] /= radii[1:]
+        ratios[0] = old[1] / new[1]
+        tables = [ratios] if own.is_radial else [ratios, np.interp(radii, new, theta[0].numpy())]
+        ratio, *angle = (np.stack((k, np.diff(k, append=k[-1]))).astype(np.float32) for k in tables)
+        ratio[0, -1] = _FAR
+        return new[-1].item(), ratio, angle[0] if angle else None
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, lens={self.lens}, turn={self.turn}"
+
+
+def points_along(scale: float) -> int:
+    """The number of points along a pixel of the view that is as long as `scale` of the picture: an
+    odd one, so that one of them is the centre."""
+    return min(_MOST_READS, 2 * math.ceil((scale / _APART - 1) / 2) + 1) if scale > 1 else 1
+
+
+def picture_size(lens: Lens) -> Pair:
+    """(H, W) of the pictures of one lens; ValueError if it does not know it."""
+    if lens.image_size is None:
+        raise ValueError("a lens that follows its picture needs an image_size")
+    height, width = lens.image_size[0].tolist()
+    return round(height), round(width)
+
+
+def centres(size: int, count: int) -> np.ndarray:
+    """`count` equally spaced points of a side, (count,)."""
+    return (np.arange(count) + 0.5) * (size / count) - 0.5
+
+
+def flat_points(lens: Lens, size: Any, y: np.ndarray, x: np.ndarray, turn: np.ndarray) -> list:
+    """The points (u, v) around the principal point, before `affine` and after a turn, of the pixels
+    at y (H,) and x (W,): two arrays (H, W) float32."""
+    cx, cy = lens.center_in(size)[0].tolist()
+    x, y = (x - cx).astype(np.float32), (y - cy).astype(np.float32)[:, None]
+    if lens.affine is not None:
+        turn = turn @ np.linalg.inv(lens.affine[0].detach().double().numpy())
+    return [a * x + b * y for a, b in turn.tolist()]

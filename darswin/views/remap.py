@@ -1,0 +1,334 @@
+"""A view bound to one camera: the map between the camera's pictures and what the view shows."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from darswin import boxes as of_boxes
+from darswin.boxes.arrays import PointMap
+from darswin.lens import Lens
+from darswin.ops import _module
+from darswin.ops.checks import check_pair, per_channel, tensor_there
+from darswin.utils.arrays import as_tensor
+from darswin.views.base import Pair, PerChannel, check_lens
+
+if TYPE_CHECKING:
+    from darswin.frames.plans import Output, Plan, Sampler
+    from darswin.views.pixels import PixelView
+
+Points = TypeVar("Points", np.ndarray, Tensor)
+
+_ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a picture is on it
+_NUDGE = 1e-3  # px, more than the rounding of points in float32
+UNKNOWN = 255  # of ids of 8 bits; distances and other maps have 0
+
+
+class MovedBoxes(NamedTuple):
+    """Boxes in another picture, as `Remap.boxes_to_image` returns them.
+
+    Attributes: boxes: (K, 4), NaN if nothing is seen; visible: (K,), the shares that are seen;
+    rays: (K, 3), the directions of the middles of the given boxes in the camera's frame, unit
+    vectors, 0 where no ray lands; None without a lens.
+    """
+
+    boxes: Any
+    visible: Any
+    rays: Any = None
+
+
+class Remap:
+    """The map between the pictures of one camera and what a view shows of them.
+
+    `view.at(lens, size)` makes it. What depends on the lens alone is computed once, when it is
+    first used, in float64; no gradient reaches the lens. Points are pixels, x and y, and their
+    centres are whole numbers; boxes have the coordinates of `darswin.boxes`. Arrays give arrays,
+    and tensors give tensors.
+
+    A view of several tiles has a map for each of them, in `tiles`. Points and boxes belong to one
+    tile; pictures and maps are those of all tiles.
+
+    Attributes:
+        view: the view. size: (H, W) of the camera's pictures. view_size: (H', W') of the view, or
+            of a tile.
+        lens: the lens of the pictures, float64 on the CPU, or None.
+
+    Raises:
+        TypeError: the lens is missing, and the view uses one.
+        ValueError: there are several lenses, or the lens belongs to pictures of another size.
+    """
+
+    def __init__(self, view: "PixelView", lens: Lens | None, size: Pair):
+        self.view, self.size = view, check_pair("size", size, 1)
+        self.view_size = view.size or self.size
+        self._given = lens
+        if (view.uses_lens or lens is not None) and len(check_lens(lens, self.size)) != 1:
+            raise ValueError(f"a view is bound to one lens, got {len(lens or ())}")
+
+    @cached_property
+    def lens(self) -> Lens | None:
+        if self._given is None:
+            return None
+        return self._given.detach().to("cpu", torch.float64)
+
+    @property
+    def some_lens(self) -> Lens:
+        """The lens; TypeError if it is None."""
+        if self.lens is None:
+            raise TypeError("rays need the lens of the pictures, but it is None")
+        return self.lens
+
+    @cached_property
+    def tiles(self) -> Sequence["Remap"]:
+        """The map of each picture that the view shows: itself, unless the view has tiles."""
+        if self.view.count == 1:
+            return [self]
+        return [Remap(tile, self._given, self.size) for tile in self.view.tiles]
+
+    @cached_property
+    def camera(self) -> Lens | None:
+        """The lens of the view's picture, if it is that of a camera."""
+        return self.view.camera(self._given, self.size)
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the view swaps left and right."""
+        return self.view.turn.mirrored
+
+    # -- points and boxes ---------------------------------------------------------------------
+
+    def to_view(self, points: Points) -> Points:
+        """Pixels (..., 2) of the picture → pixels (..., 2) of the view, also beyond its edges; NaN
+        where no ray lands. ValueError for points of another shape."""
+        return self._moved(points, lambda p: self._bound.to_view(p, self.lens, self.size))
+
+    def to_image(self, points: Points) -> Points:
+        """Pixels (..., 2) of the view → pixels (..., 2) of the picture; NaN where it shows nothing:
+        no ray lands, or it ends. ValueError for points of another shape."""
+
+        def move(pixels: Tensor) -> Tensor:
+            found = self._bound.to_image(pixels, self.lens, self.size)
+            sides = tensor_there(self.size[::-1], found)
+            beyond = (found + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
+            return torch.where(beyond.any(-1, keepdim=True), torch.nan, found)
+
+        return self._moved(points, move)
+
+    def rays(self, points: Points) -> Points:
+        """Pixels (..., 2) of the view → unit vectors (..., 3) in the camera's frame, NaN where the
+        view shows nothing."""
+        return self._moved(points, lambda p: self._bound.to_rays(p, self.some_lens, self.size))
+
+    def rays_of_image(self, points: Points) -> Points:
+        """`rays` of pixels (..., 2) of the picture."""
+        return self._moved(points, lambda p: self.some_lens.unproject_points(p, self.size))
+
+    def boxes_to_image(self, boxes: Any) -> MovedBoxes:
+        """Boxes (K, 4) of the view → boxes of the picture, by the ellipses inside them.
+
+        Boxes are cut at the edges of the view first, and those without an area are NaN. See
+        `darswin.boxes.carry`.
+        """
+        return self._boxes(boxes, self.to_image, (self.view_size, self.size), self.rays)
+
+    def boxes_to_view(self, boxes: Any) -> MovedBoxes:
+        """Boxes (K, 4) of the picture → boxes of the view: the inverse of `boxes_to_image`."""
+        sizes = self.size, self.view_size
+        return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
+
+    def _boxes(
+        self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair],
+        to_rays: PointMap,
+    ) -> MovedBoxes:  # fmt: skip
+        table = (
+            boxes.detach().to("cpu", torch.float64).numpy() if isinstance(boxes, Tensor) else boxes
+        )
+        table = of_boxes.clip(np.asarray(table, np.float64), sizes[0])
+        table[(table[:, 2:] <= table[:, :2]).any(1)] = np.nan
+        found = [*of_boxes.carry(table, points_map, sizes[1])]
+        if self.lens is not None:
+            found.append(np.nan_to_num(to_rays((table[:, :2] + table[:, 2:] - 1) / 2)))
+        if isinstance(boxes, Tensor):
+            dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
+            found = [torch.from_numpy(values).to(boxes.device, dtype) for values in found]
+        return MovedBoxes(*found)
+
+    def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
+        if (shape := tuple(np.shape(points)))[-1:] != (2,):
+            raise ValueError(f"points must have shape (..., 2), got {shape}")
+        if not isinstance(points, Tensor):
+            given = np.asarray(points)
+            moved = move(as_tensor(given, torch.float64)[None])[0]
+            return moved.numpy().astype(np.result_type(given, np.float32), copy=False)
+        moved = move(points[None].to("cpu", torch.float64))[0]
+        return moved.to(points.device, torch.promote_types(points.dtype, torch.float32))
+
+    @cached_property
+    def _bound(self) -> "PixelView":
+        return self.view if self.lens is None else self.view.for_lens(self.lens, self.size)
+
+    # -- pictures and maps --------------------------------------------------------------------
+
+    def __call__(self, picture: Points) -> Points:
+        """What the view shows of a picture; 0 where it shows nothing.
+
+        Args:
+            picture: an array (H, W) or (H, W, C), of uint8 or in floating point; or a tensor (B, C,
+                H, W), through which gradients flow.
+
+        Returns:
+            (H', W') or (H', W', C), of the picture's dtype, n tiles as (n, H', W', …); of a tensor
+            the result of `view.see`, (B·n, C, H', W').
+        """
+        if isinstance(picture, Tensor):
+            return self.view.see(picture, self._prepared)
+        if picture.shape[:2] != self.size:
+            raise ValueError(f"the picture must be (H, W) = {self.size}, got {picture.shape[:2]}")
+        return self.view.picture(picture, self)
+
+    def sampled(self, picture: np.ndarray) -> np.ndarray:
+        """`remap(picture)` by points: compiled for uint8 and float32, else through torch."""
+        planes = np.atleast_3d(picture)
+        if picture.dtype in (np.uint8, np.float32) and _module.LACK is None:
+            from darswin.frames.compiled import frames
+
+            reads = self.points.shape[1] // self.view_size[1]
+            seen = frames.read(planes, self.points, reads)
+        else:
+            images = as_tensor(planes).movedim(2, 0)[None]
+            images = images if images.is_floating_point() else images.float()
+            seen = self.view.see(images, self._prepared).movedim(1, -1).numpy()
+            seen = (seen if picture.dtype.kind == "f" else seen.round()).astype(picture.dtype)
+        tiles = (self.view.count,) if self.view.count > 1 else ()
+        return seen.reshape(*tiles, *self.view_size, *picture.shape[2:])
+
+    def sampler(
+        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
+        std: PerChannel | None = None,
+    ) -> "Sampler":  # fmt: skip
+        """A `darswin.frames.Sampler` of the camera's frames; arguments: see `plan`."""
+        from darswin.frames.plans import Sampler
+
+        return Sampler(self.plan(output, mean=mean, std=std))
+
+    def plan(
+        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
+        std: PerChannel | None = None,
+    ) -> "Plan":  # fmt: skip
+        """The points at which the camera's frames are read, for `darswin.frames.Sampler`.
+
+        Args:
+            output: "uint8" or "image", see `Plan`.
+            mean, std: the normalization of "image"; the default is the view's.
+        """
+        from darswin.frames.plans import Plan  # needs the compiled module
+
+        mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
+        if output == "uint8":
+            mean, std = 0.0, 1.0
+        if mean is None or std is None:
+            raise ValueError("frames are normalized: give the mean and the std of the network")
+        channels = max(np.size(mean), np.size(std))
+        return Plan.of_points(
+            self.points, self.size, output=output, mean=per_channel("mean", mean, channels),
+            std=per_channel("std", std, channels), tiles=self.view.count,
+            reads=self.points.shape[1] // self.view_size[1],
+        )  # fmt: skip
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """The points of the picture at which the view is read, (k·H', k·W', 2), k² for each pixel;
+        tiles are below each other. `OUTSIDE` where the view shows nothing.
+
+        Raises:
+            ValueError: the view sees nothing of the picture.
+        """
+        return self._bound.points_read(self.lens, self.size)
+
+    def target(self, target: np.ndarray) -> np.ndarray:
+        """A map of labels or distances in the view: each pixel takes the nearest, never a mixture.
+
+        If two pixels are equally near, the side alternates from pixel to pixel, so that the map is
+        not shifted relative to the picture.
+
+        Args:
+            target: (H, W), of the picture.
+
+        Returns:
+            (H', W'), of the same dtype; `UNKNOWN` in uint8, and 0 in others, where the view shows
+            nothing.
+        """
+        x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
+        height, width = self.size
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        target = np.asarray(target, target.dtype.newbyteorder("="))
+        index = np.where(inside, y * width + x, 0).astype(np.intp)
+        return np.where(inside, target.ravel()[index], UNKNOWN if target.dtype == np.uint8 else 0)
+
+    @cached_property
+    def _target_points(self) -> np.ndarray:
+        points = self._bound.points_of_target(self.lens, self.size)
+        return points + _aside(self.view_size) @ self.view.turn.matrix
+
+    def back(self, maps: Points) -> Points:
+        """A map of a network for the view → the pixels of the picture; 0 unless `shown`.
+
+        Args:
+            maps: a tensor (B·n, K, h, w) or an array (K, h, w), n tiles (n, K, h, w), also of a
+                fraction of the view's size. Maps of integers take the nearest value.
+
+        Returns:
+            (B, K, H, W), or an array (K, H, W).
+        """
+        if isinstance(maps, Tensor):
+            return self.view.back(maps, self._prepared)
+        planes = torch.from_numpy(maps.reshape(-1, *maps.shape[-3:]))
+        return self.view.back(planes, self._prepared)[0].numpy()
+
+    @property
+    def shown(self) -> np.ndarray:
+        """The pixels of the picture that the view shows, (H, W)."""
+        shown = self._prepared.shown
+        return np.ones(self.size, bool) if shown is None else shown[0].numpy()
+
+    @cached_property
+    def _prepared(self) -> Any:
+        with torch.no_grad():
+            return self._bound.prepare(self.lens, self.size, rays=False)
+
+
+class Remaps(Sequence[Remap]):
+    """The maps of N lenses, each made when it is first used."""
+
+    def __init__(self, view: "PixelView", lens: Lens | None, size: Pair):
+        self._view, self._lens, self._size = view, lens, size
+        self._made: dict[int, Remap] = {}
+
+    def __len__(self) -> int:
+        return 1 if self._lens is None else len(self._lens)
+
+    def __getitem__(self, number: Any) -> Any:
+        if not 0 <= number < len(self):
+            raise IndexError(f"there are {len(self)} lenses, got number {number}")
+        if number not in self._made:
+            lens = None if self._lens is None else self._lens[number]
+            self._made[number] = Remap(self._view, lens, self._size)
+        return self._made[number]
+
+
+def _aside(size: Pair) -> np.ndarray:
+    """The offset of each pixel, before the nearest label is chosen, (H', W', 2) px.
+
+    An even reduction puts every centre halfway between two pixels. If all took the upper one, the
+    whole target would be shifted. So neighbours move in opposite directions. Pixels at mirrored
+    places do so too, so that the target of a mirrored picture is mirrored.
+    """
+
+    def along(side: int) -> np.ndarray:
+        sign = (-1.0) ** np.arange(side // 2)
+        return _NUDGE * np.concatenate((-sign, np.zeros(side % 2), sign[::-1]))
+
+    return np.stack(np.meshgrid(along(size[1]), along(size[0])), -1)
