@@ -21,7 +21,8 @@ import torch
 from kit.timing import DEFAULT, OURS, Case, Timing, measure, measure_paced
 from peers import on_torch_threads, run_suite
 
-from darswin.frames import Sampler, plan
+from darswin.deploy.camera import plan
+from darswin.frames import Sampler
 from darswin.lens import Equidistant
 from darswin.ops import polar_sample
 from darswin.views import PolarView

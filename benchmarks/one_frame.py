@@ -31,6 +31,8 @@ from peers import Step, check, compare, forward, on_torch_threads, run_suite
 from torch import Tensor
 
 from darswin import frames, lens, optimize
+from darswin.deploy.camera import export_network
+from darswin.deploy.camera import plan as plan_of
 from darswin.deploy.export import export_onnx, export_package
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
@@ -216,8 +218,8 @@ def camera_of(name: str, folder: Path) -> Camera:
         str(folder / f"{name}.{kind}") for kind in ("network.npz", "plan.npz", "tokens.onnx")
     )
     size = frame.shape[:2]
-    frames.export(model, camera, size, network)
-    frames.plan(model, camera, size).save(plan)
+    export_network(model, camera, size, network)
+    plan_of(model, camera, size).save(plan)
     images = torch.from_numpy(frame)[None]
     export_onnx(model, graph, images, camera, fixed_lens=True, input="tokens")
     return Camera(model, camera, frame, network, plan, graph)

@@ -5,13 +5,15 @@
 Only NumPy, OpenCV and darswin.frames run here. The file is made once, where torch is installed. The
 frames of the video must have its size:
 
+    from darswin.deploy.camera import export_network, plan
+
     model, card = darswin.models.load_model("runs/camera/checkpoints/best.safetensors")
     lens = darswin.lens.load("calibration.json")
-    darswin.frames.export(model, lens, (1080, 1920), "camera.npz")
+    export_network(model, lens, (1080, 1920), "camera.npz")
 
 ONNX Runtime can run the network instead: `--graph camera.onnx --plan plan.npz`, with these files:
 
-    darswin.frames.plan(model, lens, (1080, 1920)).save("plan.npz")
+    plan(model, lens, (1080, 1920)).save("plan.npz")
     images = torch.zeros(1, 3, 1080, 1920, dtype=torch.uint8)
     export_onnx(model, "camera.onnx", images, lens, fixed_lens=True, input="tokens")
 """
@@ -35,7 +37,7 @@ class Classifier(NamedTuple):
 
 
 def by_darswin(path: str, threads: int) -> Classifier:
-    """The network in a file of `darswin.frames.export`."""
+    """The network in a file of `darswin.deploy.camera.export_network`."""
     network = Network(path)
     if [len(shape) for shape in network.shapes] != [1]:
         sys.exit(f"{path} is no classifier: it returns arrays of the shapes {network.shapes}")
@@ -81,7 +83,7 @@ def frames_of(path: str, gray: bool) -> Iterator[np.ndarray]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("video", help="a video file")
-    parser.add_argument("--network", default="camera.npz", help="a file of darswin.frames.export")
+    parser.add_argument("--network", default="camera.npz", help="a file of export_network")
     parser.add_argument("--graph", help="a file of `export_onnx`, for ONNX Runtime")
     parser.add_argument("--plan", default="plan.npz", help="with a graph: its plan")
     parser.add_argument("--threads", type=int, default=1, help="the most threads to use")

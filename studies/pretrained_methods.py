@@ -20,6 +20,7 @@ from pretrained_graphs import DETECTORS, export
 from pretrained_scenes import LENSES, SIZE, WRONG, Shot, spherical
 
 from darswin import boxes, frames
+from darswin.deploy import camera
 from darswin.lens import Lens
 from darswin.views import make_view
 
@@ -176,7 +177,7 @@ def _sampler(
     mean: tuple[float, ...], std: tuple[float, ...],
 ) -> frames.Sampler:  # fmt: skip
     seen = make_view(view, size, **json.loads(options))
-    plan = frames.plan(
+    plan = camera.plan(
         seen, told_lens(lens, wrong), (SIZE, SIZE), output="image", mean=mean, std=std
     )
     return frames.Sampler(plan)

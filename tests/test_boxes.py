@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 
 import darswin
 from darswin import boxes
+from darswin.boxes.carried import cut_polygon
 from darswin.data.labels.labels import Thing, move_things
 from darswin.lens import (
     Equidistant,
@@ -261,7 +262,7 @@ def test_a_mask_through_a_lens_agrees_with_opencv_pixel_by_pixel():
 
 def test_polygons_are_cut_finely_and_lose_what_is_not_seen():
     square = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0]])
-    cut = boxes.cut_polygon(square, 3.0)
+    cut = cut_polygon(square, 3.0)
     gaps = np.hypot(*(np.roll(cut, -1, 0) - cut).T)
     assert gaps.max() <= 3 and {tuple(p) for p in square} <= {tuple(p) for p in cut}
 

@@ -12,15 +12,12 @@ ROOT = Path(__file__).parent.parent
 FLOORS = (
     ("cli",),
     ("train",),
-    ("frames",),
     ("compat", "deploy"),
-    ("models",),
-    ("viz",),
-    ("layers",),
-    ("views",),
-    ("calibrate", "data"),
-    ("boxes", "lens"),
-    ("ops",),
+    ("models", "viz"),
+    ("data", "layers"),
+    ("calibrate", "views"),
+    ("lens",),
+    ("boxes", "frames", "ops"),
     ("utils",),
 )
 MOST_LINES = 400

@@ -9,12 +9,13 @@ from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
 from test_frame_networks import model_of, network_of
 
 from darswin import frames
+from darswin.deploy import camera
 from darswin.views import PolarView
 
 
 def sampler(rings, sectors, samples):
     view = PolarView(rings, sectors, samples, layout="tokens", mean=MEAN, std=STD).eval()
-    return frames.Sampler(frames.plan(view, ROUND, (70, 80)))
+    return frames.Sampler(camera.plan(view, ROUND, (70, 80)))
 
 
 CALLED = {

@@ -17,7 +17,7 @@ from torch import nn
 
 from darswin import create_model, frames, list_models, optimize
 from darswin.compat import OfficialDarSwin
-from darswin.deploy import packed
+from darswin.deploy import camera, packed
 from darswin.deploy.quantize import quantize_model
 from darswin.lens import Equidistant, Mei, Polynomial
 from darswin.models import Encoder, FeatureMaps, LensAdapter
@@ -70,7 +70,7 @@ def size_of(model):
 
 def network_of(model, folder, lens=ROUND, **options):
     path = Path(folder, "camera.npz")
-    frames.export(model, lens, size_of(model), path, **options)
+    camera.export_network(model, lens, size_of(model), path, **options)
     return frames.Network(path)
 
 
@@ -201,7 +201,7 @@ def test_what_cannot_be_exported_is_explained(model, changes, error, words, tmp_
     options = dict(lens=ROUND, size=(50, 60), path="camera.npz") | changes
     path = tmp_path / options.pop("path")
     with pytest.raises(error, match=words):
-        frames.export(model(), options.pop("lens"), options.pop("size"), path, **options)
+        camera.export_network(model(), options.pop("lens"), options.pop("size"), path, **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -216,7 +216,7 @@ def test_the_released_model_can_be_exported(tmp_path):
     torch.manual_seed(0)
     options = dict(embed_dim=24, depths=(1, 1), num_heads=(1, 2), samples=(4, 4), num_classes=10)
     model = OfficialDarSwin(**options, mean=0.4, std=0.2).eval()
-    frames.export(model, ROUND, (64, 64), tmp_path / "camera.npz")
+    camera.export_network(model, ROUND, (64, 64), tmp_path / "camera.npz")
     frame = random_frame(64, 64, 3)
     found = frames.Network(tmp_path / "camera.npz")(frame)
     assert_close([found], by_model(model, frame))
@@ -367,7 +367,7 @@ def test_values_that_do_not_fit_are_refused(small, tmp_path):
     np.savez_compressed(path, **arrays)
     with pytest.raises(ValueError, match="without compression"):
         frames.Network(path)
-    frames.plan(model_of(), ROUND, (70, 80)).save(path)
+    camera.plan(model_of(), ROUND, (70, 80)).save(path)
     with pytest.raises(ValueError, match="'darswin_network' is missing"):
         frames.Network(path)
 
@@ -473,11 +473,11 @@ def test_the_c_interface(tmp_path):
 def test_frames_are_read_without_torch_in_little_memory_on_every_tier(tier, tmp_path):
     model = create_model("darswin_a_micro", num_classes=10, mean=MEAN, std=STD).eval()
     frame = random_frame(966, 1280, 3)
-    frames.export(model, ROUND, frame.shape[:2], tmp_path / "camera.npz")
+    camera.export_network(model, ROUND, frame.shape[:2], tmp_path / "camera.npz")
     small = quantized_of(model_of())
-    frames.export(small, ROUND, (70, 80), tmp_path / "quantized.npz")
+    camera.export_network(small, ROUND, (70, 80), tmp_path / "quantized.npz")
     sampling = PolarView(4, 8, (2, 3), mean=MEAN, std=STD).eval()
-    frames.plan(sampling, ROUND, (70, 80)).save(tmp_path / "plan.npz")
+    camera.plan(sampling, ROUND, (70, 80)).save(tmp_path / "plan.npz")
     np.save(tmp_path / "frame.npy", frame)
     code = """if True:
         import re, sys

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin import frames
+from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt
 from darswin.views import make_view
 
@@ -70,7 +71,7 @@ def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
     options = {} if name == "square" else dict(reads=2, up=(0.1, -1, 0.2))
     mean, std = (MEAN, STD) if output == "image" else (0.0, 1.0)  # bytes are not normalized
     view = make_view(name, (48, 48), mean=mean, std=std, **options)
-    plan = frames.plan(view, LENS, SIZE, output=output)
+    plan = camera.plan(view, LENS, SIZE, output=output)
     frame = random_frame(*SIZE, 3)
     found = frames.Sampler(plan)(frame)
     seen = view(torch.from_numpy(frame)[None], LENS).numpy()
@@ -90,7 +91,7 @@ def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
 def test_points_of_a_plan_are_those_of_the_lens(name, reads):
     options = {} if name == "square" else dict(reads=reads)
     view = make_view(name, (200, 240) if name != "square" else (200, 200), mean=0, std=1, **options)
-    plan, exact = frames.plan(view, LENS, SIZE), LENS.to(torch.float64)
+    plan, exact = camera.plan(view, LENS, SIZE), LENS.to(torch.float64)
     points = np.random.default_rng(0).uniform(-0.5, 199.5, (500, 2))
     for tile in range(view.count):
         of_tile = dict(tile=tile) if view.count > 1 else {}
@@ -122,7 +123,7 @@ def test_plans_that_do_not_fit_are_refused():
         frames.Plan(*tokens, (8, 9), "tokens").points(np.zeros((1, 2)))
     view = make_view("tiles", (8, 8))
     with pytest.raises(IndexError):
-        frames.plan(view, Equidistant(40.0, 1.5), SIZE).points(np.zeros((1, 2)), tile=5)
+        camera.plan(view, Equidistant(40.0, 1.5), SIZE).points(np.zeros((1, 2)), tile=5)
     with pytest.raises(ValueError, match="sees nothing of the lens"):
         narrow = make_view("perspective", (8, 8), direction=(0, 0, -1))
-        frames.plan(narrow, Equidistant(40.0, 1.5), SIZE)
+        camera.plan(narrow, Equidistant(40.0, 1.5), SIZE)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from lens_examples import RANDOM, random_lens
 
 from darswin import create_model, frames
+from darswin.deploy import camera
 from darswin.frames import _frames
 from darswin.lens import Equidistant
 from darswin.models import LensAdapter
@@ -58,7 +59,7 @@ def by_operator(sampling, lens, frame):
 @given(calls(), st.integers(1, 3))
 def test_samples_are_those_of_the_operator_bit_for_bit(call, threads):
     lens, sampling, frame = call
-    sampler = frames.Sampler(frames.plan(sampling, lens, frame.shape[:2]))
+    sampler = frames.Sampler(camera.plan(sampling, lens, frame.shape[:2]))
     found = sampler(frame, threads=threads)
     np.testing.assert_array_equal(found, by_operator(sampling, lens, frame))
 
@@ -71,7 +72,7 @@ def test_real_cameras_and_many_points_give_the_same_bits(size, lens, layout):
     lens = lens.in_picture(size) if size[0] / size[1] == 966 / 1280 else Equidistant.from_fov(
         3.2, 0.6 * size[0], (0.4 * size[1], 0.5 * size[0]), affine=[[1.0, 0.01], [0.0, 0.9]]
     )  # fmt: skip
-    found = frames.Sampler(frames.plan(sampling, lens, size))
+    found = frames.Sampler(camera.plan(sampling, lens, size))
     expected = by_operator(sampling, lens, frame)
     for threads in (1, 2, 5):
         np.testing.assert_array_equal(found(frame, threads=threads), expected)
@@ -79,8 +80,8 @@ def test_real_cameras_and_many_points_give_the_same_bits(size, lens, layout):
 
 def test_a_polar_picture():
     frame, sampling = random_frame(64, 64, 3), layer()
-    picture = frames.Sampler(frames.plan(sampling, ROUND, (64, 64), output="uint8"))(frame)
-    plain = frames.Sampler(frames.plan(layer(layout="image", mean=0.0, std=1.0), ROUND, (64, 64)))
+    picture = frames.Sampler(camera.plan(sampling, ROUND, (64, 64), output="uint8"))(frame)
+    plain = frames.Sampler(camera.plan(layer(layout="image", mean=0.0, std=1.0), ROUND, (64, 64)))
     assert picture.shape == (8, 24, 3)
     assert np.abs(picture - 255 * plain(frame).transpose(1, 2, 0)).max() <= 0.5 + 1e-3
 
@@ -89,18 +90,18 @@ def test_no_default_stands_in_for_a_missing_normalization():
     adapter = LensAdapter(torch.nn.Identity(), 32)  # it says nothing about its network
     for known in ({}, dict(mean=MEAN), dict(std=STD)):
         with pytest.raises(ValueError, match="does not say how frames are normalised"):
-            frames.plan(adapter, ROUND, (64, 64), **known)
-    plan = frames.plan(adapter, ROUND, (64, 64), mean=MEAN, std=STD)
+            camera.plan(adapter, ROUND, (64, 64), **known)
+    plan = camera.plan(adapter, ROUND, (64, 64), mean=MEAN, std=STD)
     assert (plan.mean, plan.std, plan.output) == (MEAN, STD, "image")
-    picture = frames.plan(adapter, ROUND, (64, 64), output="uint8")  # is not normalised
+    picture = camera.plan(adapter, ROUND, (64, 64), output="uint8")  # is not normalised
     assert frames.Sampler(picture)(random_frame(64, 64, 3)).shape == (32, 32, 3)
 
 
 def test_plans_are_equal_if_their_attributes_are():
-    one_number = frames.plan(layer(), ROUND, (50, 60), mean=0.25)  # for all channels
+    one_number = camera.plan(layer(), ROUND, (50, 60), mean=0.25)  # for all channels
     assert (one_number.mean, one_number.std) == ((0.25,) * 3, STD)
-    assert one_number == frames.plan(layer(mean=0.25), ROUND, (50, 60))
-    one, same = (frames.plan(layer(), ROUND, (50, 60)) for _ in range(2))
+    assert one_number == camera.plan(layer(mean=0.25), ROUND, (50, 60))
+    one, same = (camera.plan(layer(), ROUND, (50, 60)) for _ in range(2))
     assert one == same and hash(one) == hash(same) and len({one, same}) == 1
     assert one == replace(one, mean=list(MEAN)) and one != "plan"
     moved = one.right.copy()
@@ -115,7 +116,7 @@ def test_plans_are_equal_if_their_attributes_are():
 
 
 def test_a_file_holds_the_plan(tmp_path):
-    plan, frame = frames.plan(layer(), ROUND, (50, 60)), random_frame(50, 60, 3)
+    plan, frame = camera.plan(layer(), ROUND, (50, 60)), random_frame(50, 60, 3)
     path = tmp_path / "camera.npz"
     plan.save(path)
     loaded = frames.Plan.load(path)
@@ -136,7 +137,7 @@ def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
     frame[:] = random_frame(50, 60, 3)
     if turned:
         frame = frame[::-1, :, ::-1]
-    sampler = frames.Sampler(frames.plan(layer(), ROUND, (50, 60)))
+    sampler = frames.Sampler(camera.plan(layer(), ROUND, (50, 60)))
     expected = sampler(frame)
     out = memory[at : at + expected.nbytes].view(np.float32).reshape(expected.shape)
     if at == 9500:  # just behind the frame
@@ -149,7 +150,7 @@ def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
 
 
 def test_a_view_cannot_be_written_over_its_own_frame():
-    plan = frames.plan(make_view("perspective", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
+    plan = camera.plan(make_view("perspective", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
     sampler, frame = frames.Sampler(plan), random_frame(50, 60, 3)
     with pytest.raises(ValueError, match="out must not share memory with the frame"):
         sampler(frame, out=frame)
@@ -162,7 +163,7 @@ def test_out_may_lie_in_the_gaps_of_a_frame():
     frame = room[:, : 60 * 3].reshape(50, 60, 3)
     assert np.shares_memory(frame, room)
     frame[:] = random_frame(50, 60, 3)
-    sampler = frames.Sampler(frames.plan(layer(2, 4), ROUND, (50, 60)))
+    sampler = frames.Sampler(camera.plan(layer(2, 4), ROUND, (50, 60)))
     expected = sampler(frame)
     out = room[7, 256 : 256 + expected.nbytes].view(np.float32).reshape(expected.shape)
     assert np.may_share_memory(frame, out)
@@ -213,10 +214,10 @@ ONE_CHANNEL, FOUR = (create_model("darswin_a_nano", in_chans=count) for count in
 def test_wrong_plans_are_explained(changes, error, words):
     given = dict(sample=layer(), lens=ROUND, size=(50, 60)) | changes
     with pytest.raises(error, match=words):
-        frames.plan(given.pop("sample"), given.pop("lens"), given.pop("size"), **given)
+        camera.plan(given.pop("sample"), given.pop("lens"), given.pop("size"), **given)
 
 
-PLAN = frames.plan(layer(), ROUND, (50, 60))
+PLAN = camera.plan(layer(), ROUND, (50, 60))
 
 
 def file_of(plan) -> bytes:

@@ -12,6 +12,7 @@ from darswin import boxes, frames, views
 from darswin.calibrate import calibrate
 from darswin.calibrate.inputs import checked
 from darswin.data import FullSize, fitted
+from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial
 from darswin.viz import pixels
 from darswin.viz.plot import draw_polar
@@ -30,7 +31,7 @@ BOXES = np.concatenate((PLACES, PLACES + 8), 1)
 FULL = FullSize(fitted(SIZE, 48, "crop").at(CAMERA, SIZE))
 MOVED = views.CropView((4, 4, 40, 40), (30, 30), views.Turn(0.3)).at(CAMERA, SIZE)
 REMAP = ROOM.at(CAMERA, SIZE)
-PLAN = frames.plan(ROOM, CAMERA, SIZE)
+PLAN = camera.plan(ROOM, CAMERA, SIZE)
 FOUND = calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
 
 

@@ -1,4 +1,4 @@
-// A network for the frames of one camera, from a file of darswin.frames.export.
+// A network for the frames of one camera, from a file of darswin.deploy.camera.export_network.
 //
 // The file is an archive as np.savez writes it, of these arrays:
 //   darswin_network  the version of the format, (2,) int64: see kFileVersion

@@ -18,8 +18,8 @@ from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_ov
 from darswin.cli.names import read_names
 from darswin.cli.views import named_view
 from darswin.data.scenes.targets import IGNORE
-from darswin.deploy.network import Detections, OnnxNetwork
 from darswin.frames import Sampler
+from darswin.frames.onnx import Detections, OnnxNetwork
 from darswin.lens import Lens
 from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file

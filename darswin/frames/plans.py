@@ -8,20 +8,13 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
 from darswin.frames.compiled import frames
 from darswin.utils.files import replace_file
 from darswin.utils.tables import read_table
-
-if TYPE_CHECKING:
-    import torch
-
-    from darswin.frames.reading import Reading
-    from darswin.lens import Lens
-    from darswin.views import PolarGrid
 
 Output = Literal["tokens", "image", "uint8"]
 _VERSION = 3
@@ -76,13 +69,91 @@ class Plan:
 
     @classmethod
     def of_points(
-        cls, points: np.ndarray, size: tuple[int, int], *, output: Output = "image",
-        mean: tuple[float, ...] = (0.0,), std: tuple[float, ...] = (1.0,), tiles: int = 1,
+        cls,
+        points: np.ndarray,
+        size: tuple[int, int],
+        *,
+        output: Output = "image",
+        mean: Sequence[float] = (0.0,),
+        std: Sequence[float] = (1.0,),
+        tiles: int = 1,
         reads: int = 1,
-    ) -> "Plan":  # fmt: skip
-        """The plan of single points."""
-        arrays = _at_pixels(points, size, output, tiles, reads)
-        return cls(**arrays, size=size, output=output, mean=mean, std=std, reads=reads)
+    ) -> Self:
+        """The plan that reads frames of (H, W) at points.
+
+        Args:
+            points: x and y in px, (reads·H', reads·W', 2), or those of tiles below each other; NaN
+                reads nothing.
+            tiles: the number of tiles.
+            output, mean, std, reads: as the attributes of a plan.
+
+        Raises:
+            ValueError: the output is unknown or tokens, or a side is longer than 32,767 pixels.
+        """
+        check_output(output)
+        if output == "tokens":
+            raise ValueError("only a polar grid has tokens: choose the output 'image' or 'uint8'")
+        x, y = points.transpose(2, 0, 1)
+        inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
+        x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
+        if reads > 1:
+            height, width = (side // reads for side in x.shape)
+            x, y = (v.reshape(height, reads, width, reads).swapaxes(1, 2) for v in (x, y))
+            x, y = (v.reshape(height, width, reads**2) for v in (x, y))
+        if tiles > 1:
+            x, y = (v.reshape(tiles, -1, *v.shape[1:]) for v in (x, y))
+        columns, rows = np.floor(x), np.floor(y)
+        return cls(
+            columns=columns.astype(np.int16),
+            rows=rows.astype(np.int16),
+            right=(x - columns).astype(np.float32),
+            lower=(y - rows).astype(np.float32),
+            size=check_size(size),
+            output=output,
+            mean=tuple(mean),
+            std=tuple(std),
+            reads=reads,
+        )
+
+    @classmethod
+    def of_grid(
+        cls,
+        radii: np.ndarray,
+        azimuths: np.ndarray,
+        center: np.ndarray,
+        affine: np.ndarray | None,
+        offsets: np.ndarray | None,
+        size: tuple[int, int],
+        *,
+        output: Output,
+        samples: tuple[int, int],
+        mean: Sequence[float] = (0.0,),
+        std: Sequence[float] = (1.0,),
+    ) -> Self:
+        """The plan that reads frames of (H, W) on a polar grid, as `darswin.ops.polar_sample` does.
+
+        Args:
+            radii, azimuths, center, affine, offsets: float32, the grid of one lens, see
+                `darswin.views.PolarGrid`.
+            samples: (S_r, S_φ) of a token.
+            output, mean, std: as the attributes of a plan.
+
+        Raises:
+            ValueError: the output is unknown, or a side is longer than 32,767 pixels.
+        """
+        check_output(output)
+        size = check_size(size)
+        arrays = frames.polar_places(radii, azimuths, center, affine, offsets, size)
+        if output == "tokens":
+            (rings, turns), (sr, sa) = arrays[0].shape, samples
+            arrays = tuple(
+                np.ascontiguousarray(
+                    array.reshape(rings // sr, sr, turns // sa, sa).transpose(0, 2, 1, 3)
+                )
+                for array in arrays
+            )
+        columns, rows, right, lower = arrays
+        return cls(columns, rows, right, lower, size, output, tuple(mean), tuple(std))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Plan):
@@ -177,6 +248,19 @@ class Plan:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
 
 
+def check_output(output: str) -> None:
+    """ValueError unless the output is one of a plan."""
+    if output not in get_args(Output):
+        raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
+
+
+def check_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(H, W) of frames; ValueError if a side is longer than a plan can have."""
+    if max(size) > _LARGEST_SIDE:
+        raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
+    return size
+
+
 def check_name(path: str | os.PathLike) -> None:
     """ValueError unless the name of a file of arrays ends in ".npz"."""
     if Path(path).suffix != ".npz":
@@ -240,129 +324,3 @@ class Sampler:
         self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
     ) -> np.ndarray:
         return self._sample(frame, out, threads)
-
-
-def plan(
-    sample: "torch.nn.Module",
-    lens: "Lens",
-    size: tuple[int, int],
-    *,
-    output: Output | None = None,
-    mean: float | Sequence[float] | None = None,
-    std: float | Sequence[float] | None = None,
-) -> Plan:
-    """Finds the places at which a network or a view reads the frames of a camera. Needs torch.
-
-    Args:
-        sample: a model, which reads a polar grid or a view of its own, or a view of
-            `darswin.views`. All tiles of a view are in one plan.
-        lens: the lens of the camera.
-        size: (H, W) of the frames.
-        output: the form of the result, see `Plan`. By default it is the input of the network,
-            "tokens" or "image". Only a polar grid has tokens.
-        mean, std: the normalization of the frames, a number for all channels or one for each; by
-            default the view's.
-
-    Raises:
-        TypeError: `sample` is none of these, or the size is not whole.
-        ValueError: there is more than one lens, the lens belongs to another size, the model takes
-            the images as they are, a side is longer than 32,767 pixels, the output is unknown, mean
-            or std do not fit the channels, or they are missing and the model has none.
-    """
-    from darswin.frames.reading import reading
-
-    if output is not None and output not in get_args(Output):
-        raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
-    size = check_size(size)
-    found = reading(sample, lens, size)
-    return plan_of(sample, found, size, output or found.output, mean, std)
-
-
-def check_size(size: tuple[int, int]) -> tuple[int, int]:
-    """(H, W) of frames; TypeError or ValueError if they are no size of frames."""
-    from darswin.ops.checks import check_pair
-
-    size = check_pair("size", size, 1)
-    if max(size) > _LARGEST_SIDE:
-        raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
-    return size
-
-
-def plan_of(
-    sample: "torch.nn.Module",
-    found: "Reading",
-    size: tuple[int, int],
-    output: Output,
-    mean: float | Sequence[float] | None,
-    std: float | Sequence[float] | None,
-) -> Plan:
-    """The plan of what `reading` found."""
-    from darswin.ops.checks import per_channel
-
-    if output == "uint8":
-        found = found._replace(mean=0.0, std=1.0)
-    mean, std = found.mean if mean is None else mean, found.std if std is None else std
-    if mean is None or std is None:
-        raise ValueError(
-            f"this {type(sample).__name__} does not say how frames are normalised: give the mean "
-            "and the std of its network"
-        )
-    channels = found.channels or max(np.size(mean), np.size(std))
-    points: Any = found.points
-    if found.samples is None:
-        arrays = _at_pixels(points.double().numpy(), size, output, found.tiles, found.reads)
-    else:
-        arrays = _on_grid(points, found.samples, size, output)
-    return Plan(
-        **arrays,
-        size=size,
-        output=output,
-        mean=per_channel("mean", mean, channels),
-        std=per_channel("std", std, channels),
-        reads=found.reads,
-    )
-
-
-def _on_grid(
-    grid: "PolarGrid", samples: tuple[int, int], size: tuple[int, int], output: Output
-) -> dict[str, Any]:
-    """The places of a polar grid of one lens."""
-    affine, offsets = (
-        None if x is None else x.float().numpy() for x in (grid.affine, grid.offsets)
-    )
-    radii, azimuths, center = (x.float().numpy() for x in (grid.radii, grid.azimuths, grid.center))
-    arrays = frames.polar_places(radii, azimuths, center, affine, offsets, size)
-    if output == "tokens":
-        (rows, columns), (sr, sa) = arrays[0].shape, samples
-        arrays = tuple(
-            np.ascontiguousarray(
-                array.reshape(rows // sr, sr, columns // sa, sa).transpose(0, 2, 1, 3)
-            )
-            for array in arrays
-        )
-    return dict(zip(("columns", "rows", "right", "lower"), arrays, strict=True))
-
-
-def _at_pixels(
-    points: np.ndarray, size: tuple[int, int], output: Output, tiles: int, reads: int
-) -> dict[str, Any]:
-    """The places of single points, x and y in px: (reads·H', reads·W', 2), or those of tiles below
-    each other."""
-    if output == "tokens":
-        raise ValueError("only a polar grid has tokens: choose the output 'image' or 'uint8'")
-    x, y = points.transpose(2, 0, 1)
-    inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
-    x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
-    if reads > 1:
-        height, width = (side // reads for side in x.shape)
-        x, y = (v.reshape(height, reads, width, reads).swapaxes(1, 2) for v in (x, y))
-        x, y = (v.reshape(height, width, reads**2) for v in (x, y))
-    if tiles > 1:
-        x, y = (v.reshape(tiles, -1, *v.shape[1:]) for v in (x, y))
-    columns, rows = np.floor(x), np.floor(y)
-    return dict(
-        columns=columns.astype(np.int16),
-        rows=rows.astype(np.int16),
-        right=(x - columns).astype(np.float32),
-        lower=(y - rows).astype(np.float32),
-    )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from darswin import boxes as of_boxes
-from darswin.frames.plans import Output, Plan
+from darswin.boxes.arrays import PointMap
 from darswin.lens import Lens
 from darswin.ops import _module
 from darswin.ops.checks import check_pair, per_channel, tensor_there
@@ -18,7 +18,7 @@ from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, check_lens
 
 if TYPE_CHECKING:
-    from darswin.frames.plans import Sampler
+    from darswin.frames.plans import Output, Plan, Sampler
     from darswin.views.pixels import PixelView
 
 Points = TypeVar("Points", np.ndarray, Tensor)
@@ -140,8 +140,8 @@ class Remap:
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
 
     def _boxes(
-        self, boxes: Any, points_map: of_boxes.PointMap, sizes: tuple[Pair, Pair],
-        to_rays: of_boxes.PointMap,
+        self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair],
+        to_rays: PointMap,
     ) -> MovedBoxes:  # fmt: skip
         table = (
             boxes.detach().to("cpu", torch.float64).numpy() if isinstance(boxes, Tensor) else boxes
@@ -207,7 +207,7 @@ class Remap:
         return seen.reshape(*tiles, *self.view_size, *picture.shape[2:])
 
     def sampler(
-        self, output: Output = "uint8", *, mean: PerChannel | None = None,
+        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
         std: PerChannel | None = None,
     ) -> "Sampler":  # fmt: skip
         """A `darswin.frames.Sampler` of the camera's frames; arguments: see `plan`."""
@@ -216,15 +216,17 @@ class Remap:
         return Sampler(self.plan(output, mean=mean, std=std))
 
     def plan(
-        self, output: Output = "uint8", *, mean: PerChannel | None = None,
+        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
         std: PerChannel | None = None,
-    ) -> Plan:  # fmt: skip
+    ) -> "Plan":  # fmt: skip
         """The points at which the camera's frames are read, for `darswin.frames.Sampler`.
 
         Args:
             output: "uint8" or "image", see `Plan`.
             mean, std: the normalization of "image"; the default is the view's.
         """
+        from darswin.frames.plans import Plan  # needs the compiled module
+
         mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
         if output == "uint8":
             mean, std = 0.0, 1.0

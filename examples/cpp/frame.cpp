@@ -1,7 +1,7 @@
 // Prints the class of a picture, without torch and without Python: frame NETWORK.npz PICTURE.ppm
 //
-// darswin.frames.export wrote the network of a classifier. The picture is a binary PPM (RGB) or PGM
-// (gray) file with 8 bits and without comments.
+// darswin.deploy.camera.export_network wrote the network of a classifier. The picture is a binary
+// PPM (RGB) or PGM (gray) file with 8 bits and without comments.
 
 #include <darswin_frames.h>
 

@@ -420,9 +420,7 @@ def test_without_what_a_network_needs(disc, tmp_path, monkeypatch):
     ):  # fmt: skip
         with pytest.raises(SystemExit, match=said):
             main(["predict", "--network", network, *argv])
-    monkeypatch.setattr(
-        "darswin.deploy.network.lack", lambda extra, modules: f"{modules[0]} missing"
-    )
+    monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")
     with pytest.raises(SystemExit, match="onnxruntime missing"):
         main(["predict", picture, "--network", network, "--lens", lens])
 

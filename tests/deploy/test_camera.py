@@ -12,7 +12,8 @@ import pytest
 import torch
 from videos import write_video
 
-from darswin import create_model, frames
+from darswin import create_model
+from darswin.deploy import camera
 from darswin.deploy.export import export_onnx
 from darswin.lens import Equidistant
 
@@ -31,13 +32,13 @@ def folder(request, tmp_path_factory):
     options = dict(num_classes=4, depths=(1, 1), num_heads=(1, 2), in_chans=request.param)
     model = create_model("darswin_a_nano", **options, mean=0.4, std=0.2).eval()
     torch.nn.init.normal_(model.head.weight)
-    frames.export(model, lens, SIZE, folder / "camera.npz")
-    frames.export(model, lens, SIZE, folder / "named.npz", labels=LABELS)
-    frames.plan(model, lens, SIZE).save(folder / "plan.npz")
+    camera.export_network(model, lens, SIZE, folder / "camera.npz")
+    camera.export_network(model, lens, SIZE, folder / "named.npz", labels=LABELS)
+    camera.plan(model, lens, SIZE).save(folder / "plan.npz")
     images = torch.zeros(1, request.param, *SIZE, dtype=torch.uint8)
     export_onnx(model, folder / "camera.onnx", images, lens, fixed_lens=True, input="tokens")
     dense = create_model("darswin_unet_a_nano", num_classes=2, in_chans=request.param).eval()
-    frames.export(dense, lens, SIZE, folder / "dense.npz")
+    camera.export_network(dense, lens, SIZE, folder / "dense.npz")
     classes = []
     write_video(folder / "camera.mp4", count=7, size=SIZE)
     video = cv2.VideoCapture(str(folder / "camera.mp4"))

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from darswin import create_model, frames
+from darswin import create_model
+from darswin.deploy import camera
 from darswin.deploy.export import export_package
 from darswin.lens import Spherical
 
@@ -115,7 +116,7 @@ def test_frame_prints_the_class_or_one_sentence(programs, tmp_path):
     for channels, labels in ((3, None), (3, names), (1, names)):
         options = dict(num_classes=5, mean=0.5, std=0.2, in_chans=channels)
         model = create_model("darswin_a_nano", **options).eval()
-        frames.export(model, lens, size, network, labels=labels)
+        camera.export_network(model, lens, size, network, labels=labels)
         given = pictures[..., :channels]
         with torch.no_grad():
             chances = model(given, lens).softmax(1)
@@ -132,7 +133,7 @@ def test_frame_prints_the_class_or_one_sentence(programs, tmp_path):
     picture, short = write_ppm(tmp_path / "a.ppm", pictures[0]), tmp_path / "short.ppm"
     short.write_bytes(picture.read_bytes()[:-1])
     unet, maps = create_model("darswin_unet_a_nano").eval(), tmp_path / "unet.npz"
-    frames.export(unet, lens, size, maps)
+    camera.export_network(unet, lens, size, maps)
     for arguments, error in (
         ([network, picture], "frame must have the network's 1 channels, got 3"),
         ([maps, write_ppm(tmp_path / "b.ppm", pictures[0, 1:])], "the network is no classifier"),

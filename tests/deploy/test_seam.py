@@ -9,6 +9,7 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin import create_model, frames, list_models, optimize
+from darswin.deploy import camera
 from darswin.deploy.export import export_onnx
 from darswin.lens import Spherical
 from darswin.models import LensAdapter
@@ -87,9 +88,9 @@ def test_it_does_not_matter_who_samples_the_frame(case):
     assert_same(model.run_sampled(sampled, prepared, frame), result, 1e-5)
     if prepared.points is None:
         with pytest.raises(ValueError, match="takes images as they are: it needs no plan"):
-            frames.plan(model, lens, size)
+            camera.plan(model, lens, size)
     else:
-        read = frames.Sampler(frames.plan(model, lens, size))(frame[0].numpy())
+        read = frames.Sampler(camera.plan(model, lens, size))(frame[0].numpy())
         np.testing.assert_allclose(read, sampled[0].numpy(), rtol=1e-4, atol=1e-4)
     if not isinstance(model, LensAdapter):
         fast = optimize(model)

@@ -5,9 +5,10 @@ import torch
 from helpers import create, relative_error
 
 from darswin import optimize
+from darswin.deploy.camera import plan
 from darswin.deploy.export import export_program
 from darswin.deploy.quantize import quantize_model
-from darswin.frames import Sampler, plan
+from darswin.frames import Sampler
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Spherical
 from darswin.models.saving import ModelCard, load_model, save_model

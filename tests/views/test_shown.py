@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from darswin import create_model, frames, optimize
+from darswin.deploy import camera
 from darswin.deploy.export import export_program
 from darswin.lens import Equidistant
 from darswin.models import LensAdapter
@@ -211,7 +212,7 @@ def result_of(model, path, images, folder):
         return optimize(model)(images, LENS)
     if path == "export":
         return export_program(model, images, LENS, fixed_lens=True).module()(images)
-    frames.export(model, LENS, SIZE, folder / "n.npz")
+    camera.export_network(model, LENS, SIZE, folder / "n.npz")
     frame = images[0].permute(1, 2, 0).contiguous().numpy()
     return torch.from_numpy(frames.Network(folder / "n.npz")(frame))[None]
 

@@ -11,6 +11,7 @@ from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
 from lens_examples import FRONT
 
 from darswin import frames
+from darswin.deploy import camera
 from darswin.lens import Equidistant
 from darswin.views import SquareView, make_view, turned
 
@@ -27,7 +28,7 @@ VIEWS = {
 @pytest.mark.parametrize("name", VIEWS)
 def test_plans_of_views_are_exact_pictures(name, channels):
     view, lens, frame = VIEWS[name], ROUND.with_theta_max(1.5), random_frame(64, 70, *channels)
-    found = frames.Sampler(frames.plan(view, lens, (64, 70), output="uint8"))(frame)
+    found = frames.Sampler(camera.plan(view, lens, (64, 70), output="uint8"))(frame)
     assert found.dtype == np.uint8 and found.shape == (*view.size, *channels)
     reads, exact = view.reads_of(lens, (64, 70)), lens.to(torch.float64)
     assert reads == (3 if name == "shrunk" else 1)
@@ -60,7 +61,7 @@ def cv2_view(image, points, size):
 def test_views_agree_with_opencv(view):
     smooth = cv2.GaussianBlur(random_frame(90, 120, 3), (0, 0), 3)
     lens = Equidistant.from_fov(2.6, 44.0)
-    found = frames.Sampler(frames.plan(view, lens, (90, 120), output="uint8"))(smooth)
+    found = frames.Sampler(camera.plan(view, lens, (90, 120), output="uint8"))(smooth)
     expected = cv2_view(smooth, view.at(lens, (90, 120)).points, view.size)
     assert found.shape == expected.shape == (*view.size, 3)
     assert np.abs(found.astype(int) - expected).max() <= 2  # OpenCV's weights have 5 bits
@@ -69,13 +70,13 @@ def test_views_agree_with_opencv(view):
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 def test_places_are_exact_for_lenses_in_single_precision_too(view):
     size = (966, 1280)
-    exact = frames.plan(view, FRONT.to(torch.float64), size)
-    assert frames.plan(view, FRONT, size) == exact
+    exact = camera.plan(view, FRONT.to(torch.float64), size)
+    assert camera.plan(view, FRONT, size) == exact
 
 
 def test_views_can_become_normalized_images_for_any_network():
     frame, view = random_frame(64, 64, 3), make_view("perspective", (20, 30), fov=1.0)
-    plan = frames.plan(view, ROUND, (64, 64), mean=MEAN, std=STD)
+    plan = camera.plan(view, ROUND, (64, 64), mean=MEAN, std=STD)
     picture = frames.Sampler(replace(plan, output="uint8"))(frame)
     found = frames.Sampler(plan)(frame)
     expected = (picture / 255 - MEAN) / STD

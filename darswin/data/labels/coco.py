@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from darswin.boxes import decode_rle
+from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
 from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing, box_of_mask
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
-from darswin.utils.regions import NO_AREA, area_of, box_of
 from darswin.utils.text import read_json
 
 _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from darswin.boxes import carry, carry_points, cut_polygon, decode_rle, ellipses, encode_rle
+from darswin.boxes import carry, carry_points, decode_rle, encode_rle
+from darswin.boxes.carried import cut_polygon, ellipses
+from darswin.boxes.regions import NO_AREA, Part, area_of, box_of, shown_parts
 from darswin.data.cameras import Calibrations
 from darswin.utils.image import read_header
-from darswin.utils.regions import NO_AREA, Part, area_of, box_of, shown_parts
 from darswin.views import Remap
 
 Size = tuple[int, int]

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
 from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing
 from darswin.data.scenes.files import calibration_in, pictures_in
 from darswin.utils.files import replace_file
-from darswin.utils.regions import NO_AREA, area_of, box_of
 from darswin.utils.text import read_text
 
 _SPLITS = ("train", "val", "test")

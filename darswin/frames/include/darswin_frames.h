@@ -1,7 +1,8 @@
 /* Networks for the frames of one camera, without torch and without Python.
  *
- * `darswin.frames.export` writes a file, once; libdarswin_frames.so runs it. Nothing here throws:
- * a function that fails returns NULL or -1, and darswin_last_error says in a sentence why. */
+ * `darswin.deploy.camera.export_network` writes a file, once; libdarswin_frames.so runs it. Nothing
+ * here throws: a function that fails returns NULL or -1, and darswin_last_error says in a sentence
+ * why. */
 #ifndef DARSWIN_FRAMES_H
 #define DARSWIN_FRAMES_H
 

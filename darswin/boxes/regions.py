@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-PointMap = Callable[[np.ndarray], np.ndarray]
+from darswin.boxes.arrays import PointMap
 
 NO_AREA = 1e-6  # px², of rounding
 _STEPS, _HALVINGS = 24, 26

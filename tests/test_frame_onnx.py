@@ -11,7 +11,7 @@ pytest.importorskip("onnxruntime")
 
 from graphs import DETECTORS, write_graph
 
-from darswin.deploy.network import OnnxNetwork
+from darswin.frames.onnx import OnnxNetwork
 
 SIZE = (16, 24)
 # Of three pictures: the box and the channel of its light; the last one is empty.
@@ -184,7 +184,7 @@ def test_a_network_runs_without_torch(tmp_path):
     path = write_graph(tmp_path / "n.onnx", size=SIZE)
     code = f"""
 import sys
-from darswin.deploy.network import OnnxNetwork
+from darswin.frames.onnx import OnnxNetwork
 OnnxNetwork({str(path)!r})
 assert not {{"torch", "cv2", "onnx"}} & sys.modules.keys()
 """

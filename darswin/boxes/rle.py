@@ -3,16 +3,46 @@
 Source: github.com/cocodataset/cocoapi, maskApi.c.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from darswin.boxes.arrays import Array, shape_of, to_numpy
 
 _MOST_PIXELS = 2**28  # of a mask; a file of a few bytes may declare any size
 _MOST_GROUPS = 12  # of 5 bits, for a number of 60 bits
 
 
-def checked_runs(size: Any, counts: Any) -> tuple[int, int, np.ndarray]:
+def encode_rle(mask: Array, *, compressed: bool = True) -> dict[str, Any]:
+    """A mask (H, W) in COCO's run-length encoding: {"size": [H, W], "counts": text, or a list of
+    numbers unless `compressed`}."""
+    pixels = np.asarray(to_numpy(mask)) != 0
+    if pixels.ndim != 2:
+        raise ValueError(f"a mask must have shape (H, W), got {shape_of(pixels)}")
+    flat = pixels.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    counts = np.diff(changes, prepend=0, append=flat.size).tolist()
+    counts = [0] * bool(flat.size and flat[0]) + counts
+    size = list(pixels.shape)
+    return {"size": size, "counts": _to_text(counts) if compressed else counts}
+
+
+def decode_rle(rle: Mapping[str, Any]) -> np.ndarray:
+    """The mask (H, W), bool, of COCO's run-length encoding, compressed or not.
+
+    Raises:
+        ValueError: size or counts are missing or wrong, or runs do not fill the mask.
+    """
+    try:
+        size, counts = rle["size"], rle["counts"]
+    except (KeyError, TypeError) as error:
+        raise ValueError("a run-length encoding must have a size [H, W] and counts") from error
+    height, width, runs = _checked_runs(size, counts)
+    return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape((height, width), order="F")
+
+
+def _checked_runs(size: Any, counts: Any) -> tuple[int, int, np.ndarray]:
     """Height, width and the runs, int64, which fill the mask; ValueError if they do not."""
     sides = size if isinstance(size, Sequence | np.ndarray) and len(size) == 2 else ()
     sides = [int(side) for side in sides if _is_whole(side) and 0 <= side <= _MOST_PIXELS]
@@ -24,7 +54,7 @@ def checked_runs(size: Any, counts: Any) -> tuple[int, int, np.ndarray]:
     height, width = sides
     if isinstance(counts, bytes):
         counts = counts.decode("ascii")
-    runs = _numbers(from_text(counts) if isinstance(counts, str) else counts)
+    runs = _numbers(_from_text(counts) if isinstance(counts, str) else counts)
     total = height * width
     said = f"the counts of a run-length encoding of {height} × {width} px must be"
     if runs.ndim != 1 or (runs < 0).any() or (runs > total).any():
@@ -51,7 +81,7 @@ def _numbers(counts: Any) -> np.ndarray:
     return runs
 
 
-def to_text(counts: Sequence[int]) -> str:
+def _to_text(counts: Sequence[int]) -> str:
     """Counts as differences to the count before the last, in groups of 5 bits, lowest first."""
     text = []
     for place, count in enumerate(counts):
@@ -65,7 +95,7 @@ def to_text(counts: Sequence[int]) -> str:
     return "".join(text)
 
 
-def from_text(text: str) -> list[int]:
+def _from_text(text: str) -> list[int]:
     """The counts of a text; ValueError if it is none."""
     counts: list[int] = []
     value = shift = 0

@@ -1,0 +1,21 @@
+"""Boxes, points, polygons and masks that follow a picture through a lens or a view.
+
+Boxes (x0, y0, x1, y1), polygons and points have the coordinates of COCO and torchvision: a picture
+covers (0, 0) to (W, H), and pixel i has its centre at i + 1/2. A *point map* is a function from
+points (..., 2) to points (..., 2), NumPy float64, in darswin's pixels, whose centres are integers;
+it gives NaN where nothing is seen. Examples are `Reframing.to_new`, `frames.Plan.points` and a
+view's `to_image`. Tensors give tensors of the same device and dtype, all else gives NumPy arrays.
+
+A box travels as the ellipse inside it: things touch the middles of the sides of their boxes, while
+the corners are mostly empty, so a rectangle would grow with every step.
+"""
+
+from darswin.boxes.carried import carry, carry_mask, carry_points, carry_polygon
+from darswin.boxes.overlap import clip, iou, merge
+from darswin.boxes.rle import decode_rle, encode_rle
+from darswin.boxes.sphere import spherical
+
+__all__ = [
+    "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "decode_rle", "encode_rle",
+    "iou", "merge", "spherical",
+]  # fmt: skip

@@ -1,0 +1,55 @@
+"""Boxes and points as NumPy arrays, from arrays, tensors and lists."""
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Array = Any  # a NumPy array, a tensor, or lists of numbers
+PointMap = Callable[[np.ndarray], np.ndarray]
+
+
+def _is_tensor(value: object) -> bool:
+    torch = sys.modules.get("torch")  # without it, there are no tensors
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def to_numpy(value: Any) -> Any:
+    return value.detach().cpu().numpy() if _is_tensor(value) else value
+
+
+def floats(value: Any) -> np.ndarray:
+    return np.asarray(to_numpy(value.double() if _is_tensor(value) else value), np.float64)
+
+
+def like(given: Any, value: np.ndarray) -> Any:
+    """A result with the kind, device and floating dtype of what was given."""
+    if _is_tensor(given):
+        torch = sys.modules["torch"]
+        dtype = given.dtype if value.dtype.kind == "f" and given.is_floating_point() else None
+        return torch.from_numpy(np.ascontiguousarray(value)).to(given.device, dtype)
+    dtype = np.asarray(given).dtype.newbyteorder("=")
+    both_float = value.dtype.kind == "f" and dtype.kind == "f"
+    return value.astype(dtype, copy=False) if both_float else value
+
+
+def table_of(boxes: Any) -> np.ndarray:
+    table = floats(boxes)
+    if table.shape == (0,):  # of an empty list
+        table = table.reshape(0, 4)
+    if table.ndim != 2 or table.shape[1] != 4:
+        raise ValueError(f"boxes must have shape (K, 4), got {shape_of(table)}")
+    return table
+
+
+def shape_of(array: np.ndarray) -> str:
+    return str(tuple(array.shape))
+
+
+def through(points_map: PointMap, points: np.ndarray) -> np.ndarray:
+    """Points of COCO through a map of darswin's pixels; both coordinates are NaN if one is not
+    finite."""
+    found = np.asarray(points_map(points - 0.5), np.float64) + 0.5
+    seen = np.isfinite(found[..., 0] + found[..., 1])
+    return found if seen.all() else np.where(seen[..., None], found, np.nan)

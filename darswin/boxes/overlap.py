@@ -1,0 +1,90 @@
+"""Boxes in one picture: what they have in common, and which ones show the same thing."""
+
+from typing import Any
+
+import numpy as np
+
+from darswin.boxes.arrays import Array, floats, like, shape_of, table_of, to_numpy
+
+_ROWS = 128  # boxes that are compared with all worse ones at once
+
+
+def clip(boxes: Array, size: tuple[int, int]) -> Any:
+    """Cuts boxes (K, 4) at the borders of a picture of (H, W); NaN stays NaN."""
+    height, width = size
+    return like(boxes, np.clip(table_of(boxes), 0.0, [width, height, width, height]))
+
+
+def iou(boxes: Array, others: Array) -> Any:
+    """The intersection over the union of each box (K, 4) with each of the others (L, 4): (K, L),
+    0 for boxes that are NaN or have no area."""
+    a, b = table_of(boxes)[:, None], table_of(others)[None]
+    common = _common(a, b)
+    return like(boxes, _ratio(common, _area(a) + _area(b) - common))
+
+
+def merge(
+    boxes: Array, scores: Array, labels: Array, *, iou: float = 0.5, inside: float = 0.7
+) -> Any:
+    """Merges the detections of several views of one picture.
+
+    From the best to the worst, a detection is kept unless a better one of its class that was kept
+    has an intersection over union with it above `iou`, or covers more than `inside` of its area,
+    as the whole of a thing covers the part that another tile saw.
+
+    Args:
+        boxes: (K, 4). scores: (K,). labels: (K,), the classes.
+
+    Returns:
+        The indices of the kept detections, the best first. NaN boxes and scores are left out.
+
+    Raises:
+        ValueError: other shapes, or a limit that is not in [0, 1].
+    """
+    for name, limit in (("iou", iou), ("inside", inside)):
+        if not 0 <= limit <= 1:
+            raise ValueError(f"{name} must be in [0, 1], got {limit}")
+    table, score, label = table_of(boxes), floats(scores), np.asarray(to_numpy(labels))
+    for name, given in (("scores", score), ("labels", label)):
+        if given.shape != (len(table),):
+            raise ValueError(
+                f"{name} must have shape ({len(table)},), as the boxes, got {shape_of(given)}"
+            )
+    order = np.argsort(-score, kind="stable")
+    order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
+    table, label = table[order], label[order]
+    area, kept = _area(table), np.ones(len(order), bool)
+    x0, x1 = np.ascontiguousarray(table[:, ::2].T)
+    for start in range(0, len(order), _ROWS):
+        one, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
+        meet = label[one] == label[rest]
+        meet &= x0[one] < x1[rest]
+        meet &= x1[one] > x0[rest]
+        better, worse = np.nonzero(meet)
+        ahead = better < worse
+        better, worse = better[ahead] + start, worse[ahead] + start
+        common = _common(table[better], table[worse])
+        drops = _ratio(common, area[better] + area[worse] - common) > iou
+        drops |= _ratio(common, area[worse]) > inside
+        better, worse = better[drops], worse[drops]  # sorted by the better one
+        starts = np.flatnonzero(np.diff(better, prepend=-1))
+        groups = np.split(worse, starts[1:])
+        for one, dropped in zip(better[starts].tolist(), groups, strict=False):
+            if kept[one]:
+                kept[dropped] = False
+    return like(boxes, order[kept])
+
+
+def _area(boxes: np.ndarray) -> np.ndarray:
+    return _common(boxes, boxes)
+
+
+def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The area of the intersection of boxes."""
+    low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
+    sides = np.maximum(high - low, 0)
+    return sides[..., 0] * sides[..., 1]  # several times as fast as `prod`
+
+
+def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    return np.divide(part, whole, out=np.zeros(part.shape), where=whole > 0)
