@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import darswin.lens
-from darswin.cli.views import Look, Up, to_corners
-from darswin.lens import Lens, Perspective
+from darswin.cli.views import Look, Up
+from darswin.lens import Lens
 from darswin.lens.files.load import reach
 from darswin.lens.files.opencv import Coefficients
 from darswin.utils.files import replace_file
@@ -172,11 +172,8 @@ class _Views:
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
         self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
-        camera: Lens | None = None
-        if self._look.view == "perspective":
-            fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
-            camera = to_corners(Perspective.from_fov(fov, width / 2, image_size=(height, width)))
-        return _Viewed(view.at(exact, size).sampler(), camera)
+        remap = view.at(exact, size)
+        return _Viewed(remap.sampler(), remap.camera)
 
 
 def _picture(name: str, target: Path, views: _Views, _: "Broken") -> tuple[Path, Lens | None]:

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.lens import Lens
+from darswin.lens import Lens, Perspective
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel
 from darswin.views.directions import RayView
@@ -63,6 +63,16 @@ class PerspectiveView(RayView):
     def from_plane(self, points: Tensor) -> Tensor:
         length = torch.rsqrt(1 + points.square().sum(-1, keepdim=True))
         return torch.cat((points * length, length), -1)
+
+    def camera(self, lens: Lens, size: Pair) -> Lens:
+        """A camera without distortion in the view's own frame, up to the corners of its picture."""
+        step, middle = self._layout(lens, size)
+        height, width = self.size
+        center = middle.new_tensor([[(width - 1) / 2, (height - 1) / 2]]) - middle / step
+        farthest = torch.maximum(center.abs() + 0.5, (center - center.new_tensor(
+            [[width - 0.5, height - 0.5]])).abs()).norm()  # fmt: skip
+        focal = 1 / step[:, 0]
+        return Perspective(focal, torch.atan(farthest / focal), center=center, image_size=self.size)
 
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         if self.reach is None:
