@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,14 +14,32 @@ from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
 from darswin.ops._library import transformed
 from darswin.ops.checks import readable
-from darswin.views import Prepared, View
-from darswin.views.base import Pair, PerChannel, check_images
+from darswin.views import View
+from darswin.views.base import Pair, PerChannel, PreparedPixels, PreparedPolar, check_images
 
 Result = TypeVar("Result", covariant=True)
 
 # Images in floating point with larger values have not been normalized: with ImageNet's statistics,
 # normalized images end at 2.7.
 LARGEST_NORMALIZED = 20
+
+
+class Prepared(NamedTuple):
+    """Everything of N lenses that a model needs, for images of one size.
+
+    - `view`: what its view needs; `view.shown`, (N or 1, H, W), is True for the pixels of the
+      images that the view shows, and None if it shows all.
+    - `rays`: `View.ray_channels`, if the network reads them.
+    - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
+    - `tables`: for each stage, the position biases of its blocks.
+    - `remaps`: the `Remap` of each lens, by which detections come back; None without detections.
+    """
+
+    view: PreparedPixels | PreparedPolar
+    rays: Tensor | None = None
+    tokens: Sequence[Tensor] = ()
+    tables: Sequence[Sequence[Tensor]] = ()
+    remaps: Sequence[Any] | None = None
 
 
 class Model(nn.Module, Generic[Result]):
@@ -81,7 +99,7 @@ class Model(nn.Module, Generic[Result]):
     def forward(self, images: Tensor, lens: Lens | None = None) -> Result:
         """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
         images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         return self.forward_network(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
@@ -97,11 +115,13 @@ class Model(nn.Module, Generic[Result]):
             TypeError: the lens is missing, and the model uses one.
             ValueError: the lens belongs to images of another size.
         """
-        prepared = self.view.prepare(
-            lens, size, back=self.goes_back, rays=self.reads_rays, maps=self.token_maps
+        prepared = self.view.prepare(lens, size, back=self.goes_back)
+        return Prepared(
+            prepared,
+            rays=self.view.ray_channels(lens, size) if self.reads_rays else None,
+            tokens=[self.view.token_positions(lens, of_map) for of_map in self.token_maps],
+            tables=[stage.tables(prepared) for stage in self.stages],
         )
-        tables = [stage.tables(prepared.points) for stage in self.stages]
-        return prepared._replace(tables=tables)
 
     def run(self, images: Tensor, prepared: Prepared) -> Result:
         """The result of `forward`, with the lens given as the result of `prepare`.
@@ -118,7 +138,7 @@ class Model(nn.Module, Generic[Result]):
         """
         self._check_learning(prepared)
         images = self._checked(images)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         return self.forward_network(x, prepared, images)
 
     def sample(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -133,7 +153,7 @@ class Model(nn.Module, Generic[Result]):
         Raises:
             TypeError, ValueError: as in `run`.
         """
-        return self.view.see(self._checked(images), prepared, self.dtype)
+        return self.view.see(self._checked(images), prepared.view, self.dtype)
 
     def run_sampled(
         self, sampled: Tensor, prepared: Prepared, images: Tensor | None = None
@@ -151,7 +171,7 @@ class Model(nn.Module, Generic[Result]):
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
         self._check_learning(prepared)
-        sampled = self.view.check_seen(sampled, prepared, self.in_chans)
+        sampled = self.view.check_seen(sampled, prepared.view, self.in_chans)
         self._check_device("sampled", sampled)
         if self.view.in_pixels:
             self._check_dtype("sampled", sampled)

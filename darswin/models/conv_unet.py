@@ -8,12 +8,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.lens.spacing import Spacing
+from darswin.models.base import Prepared
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.ops.checks import per_channel, side_or_pair
 from darswin.utils.tasks import PixelTask
-from darswin.views import Prepared, make_view
+from darswin.views import make_view
 from darswin.views.base import Pair, PerChannel, check_count, check_one_picture
 from darswin.views.directions import Vector
 
@@ -135,4 +136,4 @@ class ConvUnet(PixelModel):
             x = F.interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
             x = block(torch.cat((x, skip), 1))
         logits = self.head.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        return self.head.finish(self.view.back(logits, prepared), prepared.shown)
+        return self.head.finish(self.view.back(logits, prepared.view), prepared.view.shown)

@@ -3,7 +3,6 @@
 from darswin.views.base import (
     PixelGrid,
     PolarGrid,
-    Prepared,
     View,
 )
 from darswin.views.camera import CameraView
@@ -39,7 +38,6 @@ __all__ = [
     "PolarGrid",
     "PolarSample",
     "PolarView",
-    "Prepared",
     "RayView",
     "Remap",
     "SquareView",
