@@ -120,7 +120,7 @@ class Model(nn.Module, Generic[Result]):
             prepared,
             rays=self.view.ray_channels(lens, size) if self.reads_rays else None,
             tokens=[self.view.token_positions(lens, of_map) for of_map in self.token_maps],
-            tables=[stage.tables(prepared) for stage in self.stages],
+            tables=[stage.tables(prepared.grid) for stage in self.stages],
         )
 
     def run(self, images: Tensor, prepared: Prepared) -> Result:

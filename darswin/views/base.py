@@ -75,6 +75,10 @@ class PreparedPixels(NamedTuple):
     shown: Tensor | None = None
     around: Tensor | None = None
 
+    @property
+    def grid(self) -> None:
+        """Only a polar view has a polar grid."""
+
 
 class PreparedPolar(NamedTuple):
     """What a polar view needs of N lenses, for images of one size.
