@@ -124,14 +124,14 @@ format: $(STAMP)  ## format the code with ruff and clang-format
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $$(find csrc examples tests/cpp -name '*.h' -o -name '*.cpp')
 
-bench: build  ## time the operators against alternatives, and training; run nothing else meanwhile
+bench: build  ## time the operators, training and a model against alternatives; run nothing else meanwhile
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results
 	$(BIN)/python benchmarks/attention.py --out benchmarks/results
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/one_frame.py --out benchmarks/results
 	$(BIN)/python benchmarks/frames.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
-	$(BIN)/python -m darswin bench --out benchmarks/results
+	$(BIN)/python benchmarks/model.py --out benchmarks/results
 
 study: build  ## run the paper's experiments on a small scale (one hour; can be interrupted)
 	$(BIN)/python studies/study.py

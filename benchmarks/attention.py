@@ -13,10 +13,10 @@ from pathlib import Path
 import peaks
 import torch
 import torch.nn.functional as F
+from kit.timing import OURS, Case, Timing
 from peers import compare, run_suite
 from torch import Tensor
 
-from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import reference, window_attention
 
 HEAD_DIM = 32

@@ -18,9 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from kit.timing import DEFAULT, OURS, Case, Timing, measure, measure_paced
 from peers import on_torch_threads, run_suite
 
-from darswin.bench.timing import DEFAULT, OURS, Case, Timing, measure, measure_paced
 from darswin.deploy.camera import plan
 from darswin.frames import Sampler
 from darswin.lens import Equidistant

@@ -22,15 +22,15 @@ import cv2
 import numpy as np
 import onnxruntime
 import torch
+from kit.candidates import lens_of, network
+from kit.machine import on_other_tiers
+from kit.start import Start
+from kit.start import measure as measure_start
+from kit.timing import DEFAULT, OURS, Case, Timing, measure, measure_paced
 from peers import Step, check, compare, forward, on_torch_threads, run_suite
 from torch import Tensor
 
 from darswin import frames, lens, optimize
-from darswin.bench.candidates import lens_of, network
-from darswin.bench.machine import on_other_tiers
-from darswin.bench.start import Start
-from darswin.bench.start import measure as measure_start
-from darswin.bench.timing import DEFAULT, OURS, Case, Timing, measure, measure_paced
 from darswin.deploy.camera import export_network
 from darswin.deploy.camera import plan as plan_of
 from darswin.deploy.export import export_onnx, export_package

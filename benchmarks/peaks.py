@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-
-from darswin.bench.machine import THREADS, num_threads
-from darswin.bench.timing import in_turns
+from kit.machine import THREADS, num_threads
+from kit.timing import in_turns
 
 
 @dataclass

@@ -10,15 +10,12 @@ from textwrap import fill
 from typing import TypeVar
 
 import torch
-from torch import Tensor
-from tqdm import tqdm
-
-from darswin.bench import targets
-from darswin.bench.machine import THREADS, machine, num_threads, on_other_tiers
-from darswin.bench.plot import Rows, draw_panels, in_lines
-from darswin.bench.record import Record
-from darswin.bench.start import Start
-from darswin.bench.tables import (
+from kit import targets
+from kit.machine import THREADS, machine, num_threads, on_other_tiers
+from kit.plot import Rows, draw_panels, in_lines
+from kit.record import Record
+from kit.start import Start
+from kit.tables import (
     by_case,
     markdown,
     milliseconds,
@@ -27,7 +24,9 @@ from darswin.bench.tables import (
     ratios,
     starts_table,
 )
-from darswin.bench.timing import DEFAULT, MATMULS, OURS, REFERENCE, Case, Timing, measure
+from kit.timing import DEFAULT, MATMULS, OURS, REFERENCE, Case, Timing, measure
+from torch import Tensor
+from tqdm import tqdm
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]

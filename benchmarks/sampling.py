@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from kit.timing import OURS, Case, Timing, measure
 from peers import check, compare, forward, run_suite
 from torch import Tensor
 
-from darswin import polar_grid
-from darswin.bench.timing import OURS, Case, Timing, measure
+from darswin import PolarView
 from darswin.lens import Spherical
 from darswin.ops import polar_sample
 
@@ -26,7 +26,7 @@ def sampling_case(size: int, batch: int):
     """Images, the grid of the lenses, and the mesh for grid_sample and remap."""
     images = torch.randn(batch, 3, size, size)
     lens = Spherical.from_fov(torch.linspace(0.1, 0.9, batch), math.radians(170), size / 2)
-    grid = polar_grid(lens, (size, size), rings=16, sectors=64, samples=(10, 10))
+    grid = PolarView(rings=16, sectors=64, samples=(10, 10)).grid(lens, (size, size))
     x = grid.center[:, 0, None, None] + grid.radii[:, :, None] * torch.cos(grid.azimuths)
     y = grid.center[:, 1, None, None] + grid.radii[:, :, None] * torch.sin(grid.azimuths)
     mesh = 2 * torch.stack((x, y), -1) / (size - 1) - 1

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from kit.timing import OURS, Case, Timing
 from peers import compare, run_suite
 from torch import Tensor
 
-from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import polar_to_image, polar_to_image_plan
 
 PEER = "F.pad + F.grid_sample"

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kit.machine import machine, num_threads
+from kit.record import write
 from lightning.pytorch import Callback, Trainer
 from peers import training_table
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from darswin.bench.machine import machine, num_threads
-from darswin.bench.record import write
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.samples import Draw
 from darswin.ops import use_reference

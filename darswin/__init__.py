@@ -12,14 +12,12 @@ if TYPE_CHECKING:
     from darswin.deploy.optimize import optimize
     from darswin.layers.attention import PolarWindowAttention
     from darswin.models import DarSwin, create_model, list_models, load_model
-    from darswin.views import PolarGrid, PolarSample, PolarView, polar_grid
+    from darswin.views import PolarView
 
     __version__: str
 
 __all__ = [
     "DarSwin",
-    "PolarGrid",
-    "PolarSample",
     "PolarView",
     "PolarWindowAttention",
     "boxes",
@@ -32,22 +30,18 @@ __all__ = [
     "models",
     "ops",
     "optimize",
-    "polar_grid",
     "views",
 ]
 
 # The module of each public name that is no module.
 _MODULES = {
     "DarSwin": "darswin.models",
-    "PolarGrid": "darswin.views",
-    "PolarSample": "darswin.views",
     "PolarView": "darswin.views",
     "PolarWindowAttention": "darswin.layers.attention",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
     "load_model": "darswin.models",
     "optimize": "darswin.deploy.optimize",
-    "polar_grid": "darswin.views",
 }
 
 

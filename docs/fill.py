@@ -15,10 +15,9 @@ ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "studies"), str(ROOT / "benchmarks")]
 
 import peers  # noqa: E402
-
-from darswin.bench import tables as bench  # noqa: E402
-from darswin.bench.record import Record  # noqa: E402
-from darswin.bench.timing import OURS, Timing  # noqa: E402
+from kit import tables as bench  # noqa: E402
+from kit.record import Record  # noqa: E402
+from kit.timing import OURS, Timing  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = [

@@ -14,7 +14,7 @@ from darswin import PolarView
 from darswin.data import SphericalLenses, WideAngle, open_source
 from darswin.lens import Lens, Spherical
 from darswin.lens.pixels import pixel_angles
-from darswin.models import pretrained_file
+from darswin.models.registry import pretrained_file
 from darswin.models.saving import load_model
 
 SIZES = (128, 256, 512, 1024, 2048)

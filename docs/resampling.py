@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, one_hot
 
-from darswin import polar_grid
+from darswin import PolarView
 from darswin.lens import Lens, Spherical
 from darswin.lens.pixels import pixel_angles
 from darswin.ops import polar_sample, polar_to_image
@@ -49,12 +49,12 @@ def ceiling(size: int, rings: int, sectors: int, samples: int) -> float:
 def there_and_back(image: Tensor, lens: Lens, rings: int, sectors: int, samples: int) -> Tensor:
     """An image (1, C, H, W) as a polar map of mean samples, and the map as an image again."""
     size = (image.shape[2], image.shape[3])
-    grid = polar_grid(lens, size, rings=rings, sectors=sectors, samples=(samples, samples))
+    grid = PolarView(rings=rings, sectors=sectors, samples=(samples, samples)).grid(lens, size)
     fine = polar_sample(
         image, grid.radii, grid.azimuths, grid.center, samples=(samples, samples), layout="image"
     )
     polar = avg_pool2d(fine, samples).permute(0, 2, 3, 1).contiguous()
-    middle = polar_grid(lens, size, rings=rings, sectors=sectors, samples=(1, 1)).radii
+    middle = PolarView(rings=rings, sectors=sectors, samples=(1, 1)).grid(lens, size).radii
     return polar_to_image(polar, middle, grid.center, size, r_max=lens.r_max)
 
 
@@ -87,7 +87,7 @@ def four_nearest(
     """A smooth field's mean error where pixels are bilinear in a polar map, and where they are the
     mean of the four samples that are nearest; and which share of all samples those are."""
     lens = Spherical.from_fov(0.5, math.radians(175), size / 2)
-    grid = polar_grid(lens, (size, size), rings=rings, sectors=sectors, samples=(1, 1))
+    grid = PolarView(rings=rings, sectors=sectors, samples=(1, 1)).grid(lens, (size, size))
     x, y = (
         grid.radii[0][:, None] * grid.azimuths.cos(),
         grid.radii[0][:, None] * grid.azimuths.sin(),

@@ -6,10 +6,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+from records import machine, markdown, write
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.viz.plot import add_legend, page_figure, save_figure
 
 NOT_RUN = "Not run yet: `make study-calibrate`."

@@ -10,11 +10,9 @@ from pathlib import Path
 from dense_cells import MODELS, STUDIED, TASKS, Cell
 from dense_data import CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
 from dense_pictures import draw
+from records import machine, markdown, write
 from tables import spread
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.viz.plot import TEXT, add_legend, page_figure, save_figure
 
 SCORE = {"segmentation": "miou", "distance": "delta1"}

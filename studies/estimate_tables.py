@@ -4,9 +4,7 @@ import statistics
 from collections.abc import Iterable
 from pathlib import Path
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
+from records import machine, markdown, write
 
 MODELS = ("Spherical", "KannalaBrandt", "Division")
 SHOWN = "KannalaBrandt"  # whose interval the tables show

@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 from learned_problems import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
 from matplotlib.axes import Axes
+from records import machine, markdown, write
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.viz.plot import add_legend, page_figure, save_figure
 
 CLOSE = 0.5  # px, the largest distance of a lens that counts as found

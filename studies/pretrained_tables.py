@@ -10,10 +10,8 @@ from pretrained_methods import LEVEL_METHODS, SURE, Found, detect, merged
 from pretrained_pictures import detector_of
 from pretrained_scenes import COCO, SIZE, WIDE, Shot
 from pretrained_scores import ZONES
+from records import machine, markdown, write
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.viz.plot import TEXT, page_figure, save_figure
 
 NOT_RUN = "Not run yet: `make study-pretrained`."

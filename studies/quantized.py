@@ -17,12 +17,11 @@ import torch
 import yaml
 from cells import LEVELS, MODELS, SWEEP, Cell, headline
 from jobs import check_given, printing_to, run_all
+from records import machine, write
 from study import run_cell as run_float
 from tables import int8_table
 from torch.utils.data import DataLoader
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
 from darswin.cli.quantize import quantize
 from darswin.deploy.optimize import optimize
 from darswin.layers.quantized import quantized_layers

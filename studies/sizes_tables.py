@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from records import machine, markdown, write
 from sizes_methods import METHODS
 from sizes_scene import DISTANCES, LENSES, OWN, pictures
 from tables import spread
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.viz.plot import TEXT, add_legend, page_figure, save_figure
 
 WRONG = {"angles × 0.8": 0.8, "angles × 1.25": 1.25}

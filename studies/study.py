@@ -13,9 +13,9 @@ from pathlib import Path
 
 from cells import LEVELS, POLYNOMIAL, SWEEP, Cell, ablations, augmented, headline
 from jobs import check_given, printing_to, run_all
+from records import machine
 from tables import collect
 
-from darswin.bench.machine import machine
 from darswin.cli.main import main as darswin
 from darswin.utils.files import replace_file
 

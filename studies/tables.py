@@ -5,10 +5,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from cells import ABLATIONS, AUGMENTED, LEVELS, MODELS, POLYNOMIAL, SWEEP, augmented_label
+from records import machine, markdown, write
 
-from darswin.bench.machine import machine
-from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.data.lens_distributions import LEVELS as RANGES
 from darswin.viz.plot import add_legend, page_figure, save_figure
 

@@ -11,7 +11,6 @@ ROOT = Path(__file__).parent.parent
 # From the top down. Folders of one floor do not import each other.
 FLOORS = (
     ("cli",),
-    ("bench",),
     ("train",),
     ("compat", "deploy"),
     ("models", "viz"),

@@ -16,8 +16,8 @@ import pytest
 
 from darswin import lens
 from darswin.lens.ideal import FocalLens
-from darswin.models import create, list_models, list_pretrained, load_model
-from darswin.models.registry import model_class
+from darswin.models import create, list_models, load_model
+from darswin.models.registry import list_pretrained, model_class
 
 ROOT = Path(__file__).parent.parent
 # In place of CMake: the modules are compiled already.

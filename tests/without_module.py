@@ -31,7 +31,7 @@ def main() -> None:
 
     assert ops.cpu_capability() == "reference"
     with ops.use_reference(False):
-        assert ops.reference_in_use()
+        assert ops._library.reference_in_use()
     # A gradient that only the reference has.
     azimuths = torch.linspace(0, 6, 8, requires_grad=True)
     radii, center = torch.linspace(1, 9, 8)[None], torch.full((1, 2), 15.5)

@@ -1,14 +1,18 @@
 """`darswin info` and `darswin models`."""
 
 import platform
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
 
 import torch
 
-from darswin.bench.machine import machine
 from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.layers.linear import onednn_lack
-from darswin.models import list_models, list_pretrained, read_card
-from darswin.ops import _module
+from darswin.models import list_models
+from darswin.models.registry import list_pretrained
+from darswin.models.saving import read_card
+from darswin.ops import _module, cpu_capability
 from darswin.utils import extras
 
 EXTRAS = ("demo", "onnx", "train")
@@ -35,16 +39,15 @@ def info() -> None:
 
 def facts() -> dict[str, str]:
     """Versions, CPU, instruction-set tiers, threads, oneDNN, and which extras are installed."""
-    here = machine()
-    commit = f", commit {here['commit']}" if here["commit"] else ""
-    lack = _module.LACK
-    made = f"compiled by {here['compiler']}" if lack is None else "without its compiled module"
+    lack, checkout = _module.LACK, commit()
+    compiler = f"compiled by {_module.build_info()['compiler']}"
+    made = compiler if lack is None else "without its compiled module"
     lines = {
-        "darswin": f"{here['darswin']}{commit}, {made}",
-        "torch": str(here["torch"]),
-        "python": f"{here['python']}, {platform.platform()}",
-        "CPU": f"{here['cpu']}, {torch.get_num_threads()} threads",
-        "tier": f"{here['tier']}, of {', '.join(_module.tiers())}",
+        "darswin": f"{version('darswin')}{f', commit {checkout}' * bool(checkout)}, {made}",
+        "torch": torch.__version__,
+        "python": f"{platform.python_version()}, {platform.platform()}",
+        "CPU": f"{cpu()}, {torch.get_num_threads()} threads",
+        "tier": f"{cpu_capability()}, of {', '.join(_module.tiers())}",
     }
     if lack is not None:
         lines["tier"] = f"the PyTorch reference: {lack}"
@@ -61,3 +64,31 @@ def facts() -> dict[str, str]:
 
 def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
+
+
+def cpu() -> str:
+    """The name of this CPU."""
+    # Family and model are added on x86, because the name may stay the same for years.
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    read = {key.strip(): value.strip() for key, _, value in (s.partition(":") for s in lines)}
+    name = read.get("model name", platform.processor())
+    if "cpu family" not in read:
+        return name
+    return f"{name} (family {read['cpu family']}, model {read['model']})"
+
+
+def commit() -> str:
+    """The commit of a checkout, which is "-dirty" if a file has changed; "" elsewhere."""
+    root = Path(__file__).parent.parent.parent
+    if not (root / ".git").exists():
+        return ""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True).stdout
+
+    # The records of a run, which are written one by one, are no change of the code.
+    changes = git("status", "--porcelain", "-uno", "--", ".", ":!benchmarks/results")
+    return git("describe", "--always").strip() + "-dirty" * bool(changes)

@@ -56,7 +56,7 @@ COMMANDS = {
     "convert": Command(
         "converts a pickled checkpoint to safetensors, without executing it",
         (),
-        "darswin.compat:convert_checkpoint",
+        "darswin.compat.checkpoint:convert_checkpoint",
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
@@ -68,11 +68,6 @@ COMMANDS = {
         "writes pictures and labels as another lens or a view sees them",
         PICTURES,
         "darswin.cli.warp:warp",
-    ),
-    "bench": Command(
-        "measures the speed of a model on this machine (15 minutes)",
-        (),
-        "darswin.cli.bench:bench",
     ),
     "info": Command(
         "prints versions, CPU and extras, for bug reports", (), "darswin.cli.info:info"

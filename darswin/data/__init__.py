@@ -1,31 +1,26 @@
 """Data: images seen through lenses."""
 
-from darswin.data.augment import Mixing, RandAugment, RandomErasing
+from darswin.data.augment import Mixing, RandAugment
 from darswin.data.cameras import Calibrations
 from darswin.data.framing import FullSize, fitted
-from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
+from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses
 from darswin.data.pictures import open_source
 from darswin.data.sample import Sample
-from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import IGNORE
-from darswin.data.splits import LeftOut
 from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import WideAngle
 
 __all__ = [
     "IGNORE",
     "LEVELS",
-    "Calibrated",
     "Calibrations",
     "FullSize",
-    "LeftOut",
     "Mixing",
     "PolynomialLenses",
     "RandAugment",
-    "RandomErasing",
     "RandomTurns",
     "Sample",
     "SceneSamples",
@@ -35,5 +30,4 @@ __all__ = [
     "fitted",
     "open_scenes",
     "open_source",
-    "parse_lenses",
 ]

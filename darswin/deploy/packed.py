@@ -4,10 +4,11 @@ They are plain callables: a module would take a microsecond more for each call.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from functools import cache, cached_property, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -24,7 +25,7 @@ from darswin.deploy.own import (
 )
 from darswin.deploy.program import RUN, Program, Weights
 from darswin.layers.attention import WindowAttention
-from darswin.layers.linear import best_seconds, onednn_lack
+from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import (
     Quantization,
     QuantizedLinear,
@@ -32,8 +33,7 @@ from darswin.layers.quantized import (
     quantized_layers,
 )
 
-__all__ = ["fastest_dtype"]
-
+Key = TypeVar("Key")
 Layer = Callable[[Tensor], Tensor]
 # The map of a stage, which may change, and the position biases of its blocks → the map.
 Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
@@ -303,3 +303,15 @@ def fastest_dtype() -> torch.dtype:
     with torch.inference_mode():
         seconds = best_seconds(runs, turns=9)
     return min(seconds, key=seconds.__getitem__)
+
+
+def best_seconds(runs: Mapping[Key, Callable[[], object]], turns: int) -> dict[Key, float]:
+    """The shortest time of each run in seconds. Runs take turns; the first turn does not count."""
+    seconds = dict.fromkeys(runs, float("inf"))
+    for turn in range(turns):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            if turn:  # in the first turn oneDNN prepares itself for the shape
+                seconds[name] = min(seconds[name], time.perf_counter() - start)
+    return seconds

@@ -211,11 +211,8 @@ class Plan:
     def load(cls, path: str | os.PathLike) -> "Plan":
         """Reads a plan from a file.
 
-        Files of versions 1 and 2 are read too. Some of version 1 normalize before they interpolate;
-        the samples of such a plan now differ from those of its time by rounding.
-
         Raises:
-            ValueError: the file is no plan, is damaged, or comes from a newer version of darswin.
+            ValueError: the file is no plan, is damaged, or comes from another version of darswin.
             OSError: the file cannot be read.
         """
         name = os.fspath(path)
@@ -230,9 +227,10 @@ class Plan:
             raise ValueError(f"{name} is no plan of darswin.frames, or it is damaged") from error
         if version > _VERSION:
             raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
+        if version < _VERSION:
+            raise ValueError(f"{name} comes from an older version of darswin: make the plan again")
         try:
-            digest = content.pop("digest", None)  # older files have none
-            if damaged or (digest is not None and digest.item() != _digest(content)):
+            if damaged or content.pop("digest").item() != _digest(content):
                 raise ValueError("other values than those that were written")
             height, width = content["size"].tolist()
             return cls(
@@ -244,7 +242,7 @@ class Plan:
                 output=content["output"].item(),
                 mean=tuple(content["mean"].tolist()),
                 std=tuple(content["std"].tolist()),
-                reads=content["reads"].item() if version > 2 else 1,
+                reads=content["reads"].item(),
             )
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error

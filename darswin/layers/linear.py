@@ -4,20 +4,14 @@ In float32, torch uses its BLAS. In the wheels for x86-64 this is MKL, which is 
 oneDNN on AMD's CPUs. oneDNN is part of torch's own library.
 """
 
-import time
-from collections.abc import Callable, Mapping
-from functools import cache, partial
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from functools import cache
+from typing import Any, Literal, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-__all__ = ["Linear", "autotune_results"]
-
-Key = TypeVar("Key")
-MatmulBackend = Literal["torch", "onednn", "autotune"]
+MatmulBackend = Literal["torch", "onednn"]
 MATMUL_BACKENDS = get_args(MatmulBackend)
 
 
@@ -69,49 +63,11 @@ def _onednn_product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
     return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
 
 
-# The inputs: rows x (M, D), a weight w (D', D), and the gradient g (M, D') of the result.
-_PRODUCTS: dict[str, dict[str, Callable]] = {
-    "forward": {"torch": F.linear, "onednn": _onednn_product},
-    "input gradient": {
-        "torch": lambda g, w: g @ w,
-        "onednn": lambda g, w: _onednn_product(g, w.t()),
-    },
-    "weight gradient": {
-        "torch": lambda g, x: g.t() @ x,
-        # oneDNN needs one of the two matrices transposed in memory.
-        "onednn": lambda g, x: _onednn_product(g.t().contiguous(), x.t()),
-    },
-}
-
-
-class Shape(NamedTuple):
-    """The key of an autotune measurement."""
-
-    product: str  # "forward", "input gradient" or "weight gradient"
-    rows: int  # of the input, rounded up to a power of two
-    in_features: int
-    out_features: int
-    threads: int
-
-
-_measured: dict[Shape, dict[str, float]] = {}
-
-
-def autotune_results() -> dict[Shape, dict[str, float]]:
-    """The measured seconds of each library for each shape so far, with the fastest one first."""
-    return {
-        shape: dict(sorted(seconds.items(), key=lambda item: item[1]))
-        for shape, seconds in _measured.items()
-    }
-
-
 class Linear(nn.Linear):
     """`nn.Linear` with a choice of the library that computes its matrix products.
 
-    `matmul_backend` is "torch", "onednn" or "autotune". "autotune" measures both libraries at the
-    first call with a shape and uses the faster one from then on; `autotune_results` shows the
-    measurements. Both libraries compute in float32 but round differently, so choose one of them if
-    a run must repeat bit for bit. Second derivatives need "torch".
+    `matmul_backend` is "torch" or "onednn". Both libraries compute in float32 but round
+    differently. Second derivatives need "torch".
 
     The choice applies to float32 on the CPU in eager mode. In all other cases torch computes the
     products: in compiled graphs, without oneDNN, and in bfloat16 or under autocast, where torch
@@ -124,7 +80,7 @@ class Linear(nn.Linear):
         """(..., D) → (..., D')."""
         if self.matmul_backend == "torch" or not _is_concerned(x, self.weight):
             return super().forward(x)
-        return _Product.apply(x, self.weight, self.bias, self.matmul_backend)
+        return _Product.apply(x, self.weight, self.bias)
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, matmul_backend={self.matmul_backend!r}"
@@ -142,12 +98,12 @@ def _is_concerned(x: Tensor, weight: Tensor) -> bool:
 
 
 class _Product(torch.autograd.Function):
+    """By oneDNN: the product, and both of its backward."""
+
     @staticmethod
-    def forward(ctx, x, weight, bias, matmul_backend):
+    def forward(ctx, x, weight, bias):
         ctx.save_for_backward(x, weight)
-        ctx.matmul_backend = matmul_backend
-        rows = x.reshape(-1, x.shape[-1])
-        out = _multiply("forward", matmul_backend, weight, rows, weight, bias)
+        out = _onednn_product(x.reshape(-1, x.shape[-1]), weight, bias)
         return out.view(*x.shape[:-1], weight.shape[0])
 
     @staticmethod
@@ -155,40 +111,13 @@ class _Product(torch.autograd.Function):
     def backward(ctx, grad):
         x, weight = ctx.saved_tensors
         rows, grad_rows = x.reshape(-1, x.shape[-1]), grad.reshape(-1, grad.shape[-1])
-        wants_x, wants_weight, wants_bias, _ = ctx.needs_input_grad
+        wants_x, wants_weight, wants_bias = ctx.needs_input_grad
         grad_x = grad_weight = grad_bias = None
         if wants_x:
-            grad_x = _multiply("input gradient", ctx.matmul_backend, weight, grad_rows, weight)
-            grad_x = grad_x.view(x.shape)
+            grad_x = _onednn_product(grad_rows, weight.t()).view(x.shape)
         if wants_weight:
-            grad_weight = _multiply("weight gradient", ctx.matmul_backend, weight, grad_rows, rows)
+            # oneDNN needs one of the two matrices transposed in memory.
+            grad_weight = _onednn_product(grad_rows.t().contiguous(), rows.t())
         if wants_bias:
             grad_bias = grad_rows.sum(0)
-        return grad_x, grad_weight, grad_bias, None
-
-
-def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows: Tensor, *others):
-    """A product of (M, ...) rows and other operands, by the chosen or the faster library."""
-    libraries = _PRODUCTS[product]
-    if matmul_backend == "onednn":
-        return libraries["onednn"](rows, *others)
-    height = 1 << (rows.shape[0] - 1).bit_length()
-    out_features, in_features = weight.shape
-    shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
-    if shape not in _measured:
-        runs = {name: partial(library, rows, *others) for name, library in libraries.items()}
-        _measured[shape] = best_seconds(runs, turns=5)
-    seconds = _measured[shape]
-    return libraries[min(seconds, key=seconds.__getitem__)](rows, *others)
-
-
-def best_seconds(runs: Mapping[Key, Callable[[], object]], turns: int) -> dict[Key, float]:
-    """The shortest time of each run in seconds. Runs take turns; the first turn does not count."""
-    seconds = dict.fromkeys(runs, float("inf"))
-    for turn in range(turns):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            if turn:  # in the first turn oneDNN prepares itself for the shape
-                seconds[name] = min(seconds[name], time.perf_counter() - start)
-    return seconds
+        return grad_x, grad_weight, grad_bias

@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 
-__all__ = ["quantized_layers", "without_quantized_layers"]
-
 Net = TypeVar("Net", bound=nn.Module)
 
 _LARGEST = 127  # weights lie in -127 … 127, so that they are symmetric

@@ -16,8 +16,6 @@ from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.views import PolarGrid
 
-__all__ = ["Block", "DropPath", "Mlp", "PatchMerging", "Stage"]
-
 
 class DropPath(nn.Module):
     """Stochastic depth: in training, drops the branch of an image with probability p."""

@@ -4,7 +4,7 @@ Every lens is a batch, is differentiable in its parameters, and works beyond 90Â
 """
 
 from darswin.lens.base import MODELS, Lens, from_dict, to_dict
-from darswin.lens.curves import Tabulated, as_curves, cat
+from darswin.lens.curves import Tabulated, cat
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
 from darswin.lens.files.load import load, load_all, load_up
 from darswin.lens.files.save import save
@@ -18,7 +18,7 @@ from darswin.lens.ideal import (
     Stereographic,
 )
 from darswin.lens.parameter import Number
-from darswin.lens.pixels import distance_to_z, pixel_rays, reproject, solid_angles, z_to_distance
+from darswin.lens.pixels import distance_to_z, pixel_rays, reproject, z_to_distance
 from darswin.lens.plausible import ImplausibleLens
 from darswin.lens.polynomial import OCam, OCamInverse, Polynomial
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
@@ -27,7 +27,7 @@ __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
     "FieldOfView", "Fisheye624", "Fit", "ImplausibleLens", "KannalaBrandt", "Lens", "Mei", "Number",
     "OCam", "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical",
-    "Stereographic", "Tabulated", "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load",
-    "load_all", "load_up", "pixel_rays", "reproject", "save", "solid_angles", "to_dict",
+    "Stereographic", "Tabulated", "cat", "distance_to_z", "fit", "from_dict", "load",
+    "load_all", "load_up", "pixel_rays", "reproject", "save", "to_dict",
     "z_to_distance",
 ]  # fmt: skip

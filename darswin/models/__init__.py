@@ -7,9 +7,8 @@ from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps
-from darswin.models.features import FeatureInfo
-from darswin.models.registry import list_models, list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, NoCardError, load_model, read_card, save_model
+from darswin.models.registry import list_models
+from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet
 
@@ -18,19 +17,14 @@ __all__ = [
     "ConvUnet",
     "DarSwin",
     "Encoder",
-    "FeatureInfo",
     "FeatureMaps",
     "LensAdapter",
     "Model",
     "ModelCard",
-    "NoCardError",
     "Swin",
     "Unet",
     "create_model",
     "list_models",
-    "list_pretrained",
     "load_model",
-    "pretrained_file",
-    "read_card",
     "save_model",
 ]

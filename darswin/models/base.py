@@ -321,7 +321,7 @@ class Model(nn.Module, Generic[Result]):
         """Chooses the library that computes the matrix products of the linear layers.
 
         Args:
-            matmul_backend: "torch", "onednn" or "autotune"; see `Linear`.
+            matmul_backend: "torch" or "onednn"; see `Linear`.
 
         Raises:
             ValueError: the backend is unknown.

@@ -173,10 +173,11 @@ def _parsed(entry: str) -> ModelCard:
         values = json.loads(entry)
     except ValueError as error:
         raise ValueError(f"its model card is no JSON: {error}") from error
-    if type(values) is not dict or "model" not in values:
-        raise ValueError(f'its model card must be an object with a "model", got {short(values)}')
-    # Older files lack some fields.
-    known = {name: values[name] for name in _FIELDS if name in values}
+    if type(values) is not dict:
+        raise ValueError(f"its model card must be an object, got {short(values)}")
+    if missing := [name for name in _FIELDS if name not in values]:
+        raise ValueError(f"its model card lacks {', '.join(missing)}")
+    known = {name: values[name] for name in _FIELDS}
     for name, value in known.items():
         fits, expected = _FIELDS[name]
         if not fits(value):

@@ -7,7 +7,7 @@ They use as many threads as torch. Outside of training these are not the threads
 forked process may call them.
 """
 
-from darswin.ops._library import reference_in_use, use_reference
+from darswin.ops._library import use_reference
 from darswin.ops._module import cpu_capability
 from darswin.ops.polar_sample import polar_sample
 from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
@@ -18,7 +18,6 @@ __all__ = [
     "polar_sample",
     "polar_to_image",
     "polar_to_image_plan",
-    "reference_in_use",
     "use_reference",
     "window_attention",
 ]

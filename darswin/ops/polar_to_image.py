@@ -34,7 +34,7 @@ def polar_to_image(
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
-        points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `polar_grid`.
+        points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `PolarView`.
 
     Args:
         x: (B, R, A, D), float32, float64 or bfloat16.

@@ -15,8 +15,6 @@ from torch import Tensor
 from darswin.ops._sampling import Sampling
 from darswin.ops.checks import tensor_there
 
-__all__ = ["polar_sample", "polar_to_image", "window_attention"]
-
 _WORD = 0xFFFFFFFF
 # Up to this side of an image, its coordinates between -1 and 1 are exact to 1e-5 px in float32.
 _MESH_SIDE = 256

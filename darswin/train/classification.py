@@ -17,8 +17,6 @@ from darswin.train.task import Batch, TaskModule, finite_loss
 from darswin.utils.parameters import check
 from darswin.viz.plot import draw_accuracy, page_figure
 
-__all__ = ["Classification"]
-
 
 class Classification(TaskModule):
     """A classifier of wide-angle images, with its loss, its optimiser and its accuracy.

@@ -27,8 +27,6 @@ from darswin.train.runs import ignore_signals
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit
 
-__all__ = ["RunData", "WideAngleData"]
-
 SMALLEST = 32  # px, the size of images of smaller pictures
 
 SamplesT = TypeVar("SamplesT", bound=Samples)

@@ -12,8 +12,6 @@ from darswin.train.scene_data import SceneData
 from darswin.train.task import Batch
 from darswin.utils.parameters import check, naming
 
-__all__ = ["Distance", "DistanceData", "distance_loss"]
-
 DistanceLoss = Literal["silog", "l1", "log_l1"]
 METRICS = ("abs_rel", "sq_rel", "rmse", "rmse_log", "silog", "delta1", "delta2", "delta3")
 

@@ -15,8 +15,6 @@ from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan
 from darswin.train.task import Batch, TaskModule, finite_loss
 from darswin.viz.pixels import Row, draw_predictions
 
-__all__ = ["PixelModule"]
-
 _SHOWN = 4  # samples in the figure of a test
 _EARLY = 100  # batches after which a training without any target stops
 

@@ -229,9 +229,8 @@ def _say_no_lost_connection(error: Any) -> None:
 
 # A change takes effect at the checkpoint, and is said. These options may not change: they decide on
 # the network, the groups of its parameters, its images, the size of a step, or which pictures and
-# labels count. A new option may change unless it is listed here. Otherwise no older run could go
-# on, because it lacks the option. So that nobody forgets to list one that matters, a test has a
-# table of all options, and fails for an option that is not in it.
+# labels count. So that nobody forgets to list an option that matters, a test has a table of all
+# options, and fails for an option that is not in it.
 FIXED = {
     *("task", "seed_everything", "trainer.accumulate_grad_batches"),
     *("model.name", "model.options", "model.weights", "model.freeze_stages"),
@@ -248,8 +247,7 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str
     changes = {
         name: f"{now[name]!r} in place of {before.get(name)!r}"
         for name in now
-        # An older run may lack an option; the option is no change if it is off now.
-        if now[name] != before.get(name) and (name in before or now[name])
+        if now[name] != before.get(name)
     }
     if refused := [name for name in changes if name in FIXED]:
         each = "; ".join(f"`{name}` {changes[name]}" for name in refused)
@@ -260,7 +258,7 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a configuration by their qualified names."""
-    found: dict[str, Any] = {"task": "classification"}  # the task of runs that name none
+    found: dict[str, Any] = {}
     for group, value in config.items():
         if group in ("model", "data", "trainer"):
             found |= {f"{group}.{name}": own for name, own in value.items()}

@@ -11,8 +11,6 @@ from darswin.data.scenes.targets import Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
 
-__all__ = ["SceneData"]
-
 
 class SceneData(RunData):
     """Scenes of calibrated cameras: images, their lenses, and a label or a distance for each pixel.

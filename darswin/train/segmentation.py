@@ -16,8 +16,6 @@ from darswin.train.pixel_task import PixelModule
 from darswin.train.scene_data import SceneData
 from darswin.utils.parameters import check, naming
 
-__all__ = ["LabelData", "Segmentation", "label_loss"]
-
 LabelLoss = Literal["ce", "dice", "ce+dice"]
 
 

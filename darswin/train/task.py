@@ -33,8 +33,6 @@ from darswin.train.finetuning import (
 from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 
-__all__ = ["TaskModule"]
-
 Batch = tuple[Tensor, Lens, Tensor]
 
 
@@ -65,9 +63,8 @@ class TaskModule(LightningModule):
         weight_decay: the weight decay of AdamW.
         decay_position_bias: decays position biases too, as the authors' code does.
         reference_batch: images per step for which the learning rates are meant.
-        matmul_backend: the library for float32 matrix products: torch, onednn, or autotune, which
-            measures both while it runs. onednn is twice as fast on AMD CPUs. The choice changes how
-            results are rounded.
+        matmul_backend: the library for float32 matrix products: torch or onednn, which is twice as
+            fast on AMD CPUs. The choice changes how results are rounded.
         grad_checkpointing: saves a third of the memory for activations and costs a few percent of
             the time.
         seed: seeds the weights, the jitter, drop path and mixing.

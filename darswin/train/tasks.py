@@ -9,8 +9,6 @@ from darswin.train.segmentation import LabelData, Segmentation
 from darswin.train.task import TaskModule
 from darswin.utils.tasks import Task
 
-__all__ = ["TASKS"]
-
 
 class Kind(NamedTuple):
     """The Lightning module of a task, and its data."""

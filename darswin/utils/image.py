@@ -14,8 +14,6 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from darswin.utils.exif import TURNS
 from darswin.utils.files import check_is_file, replace_file
 
-__all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
-
 WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 
 _PNG = b"\x89PNG\r\n\x1a\n"

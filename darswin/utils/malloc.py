@@ -3,8 +3,6 @@
 import ctypes
 from collections.abc import Callable
 
-__all__ = ["keep_freed_memory"]
-
 # Constants of glibc's malloc.h.
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 
@@ -15,7 +13,7 @@ def keep_freed_memory() -> bool:
     By default, glibc returns much of the memory of a training step to the system. In the next step
     the system must find and zero tens of thousands of pages again, which takes a fifth of the time.
     With this setting, the process keeps its peak memory until it ends. Call it before the first
-    step; `darswin fit` and `darswin bench` do so.
+    step; `darswin fit` does so.
 
     Returns:
         True if there is a glibc.

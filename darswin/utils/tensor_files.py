@@ -28,7 +28,7 @@ def write_tensors(
 def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors of a file and its metadata.
 
-    Files of other programs have no digest, and neither have our older ones. They are not checked.
+    Files of other programs have no digest and are not checked.
 
     Raises:
         ValueError: the file is no safetensors file, or its content is not what was written.

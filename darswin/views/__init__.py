@@ -15,7 +15,7 @@ from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.pixels import PixelView
 from darswin.views.plain import PlainView
-from darswin.views.polar import PolarSample, PolarView, polar_grid
+from darswin.views.polar import PolarView
 from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.remap import Remap
 from darswin.views.square import SquareView
@@ -36,7 +36,6 @@ __all__ = [
     "PixelView",
     "PlainView",
     "PolarGrid",
-    "PolarSample",
     "PolarView",
     "RayView",
     "Remap",
@@ -48,7 +47,6 @@ __all__ = [
     "View",
     "list_views",
     "make_view",
-    "polar_grid",
     "register_view",
     "turned",
     "up_of",

@@ -223,7 +223,11 @@ class PolarView(View):
         return self.spacing if self.sample_spacing is None else self.sample_spacing
 
     def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
-        """The grid of N lenses. A lens without principal point gets the centre of (H, W)."""
+        """The grid of N lenses. A lens without principal point gets the centre of (H, W).
+
+        Raises:
+            ValueError: the spacing is "tan" and a lens has θ_max ≥ 90°.
+        """
         steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
         borders, points = self._rings(lens, self.inner_spacing, steps_r)
         sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
@@ -333,9 +337,6 @@ class PolarView(View):
         )
 
 
-PolarSample = PolarView  # its name before the views
-
-
 @register_view("polar")
 def polar_image(size: Pair, **options: Any) -> PolarView:
     """The polar view as an image with a row for each ring, from the centre to θ_max.
@@ -344,20 +345,6 @@ def polar_image(size: Pair, **options: Any) -> PolarView:
         size: (R, A). options: the other arguments of `PolarView`.
     """
     return PolarView(*size, samples=(1, 1), layout="image", **options)
-
-
-def polar_grid(lens: Lens, image_size: tuple[int, int], **settings: Any) -> PolarGrid:
-    """Cuts the image of each lens into rings × sectors and places samples in each.
-
-    Args:
-        lens: N lenses.
-        image_size: (H, W); its centre is the principal point of a lens that has none.
-        settings: the arguments of `PolarView`.
-
-    Raises:
-        ValueError: a setting is wrong, or the spacing is "tan" and a lens has θ_max ≥ 90°.
-    """
-    return PolarView(**settings).grid(lens, image_size)
 
 
 def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:

@@ -11,8 +11,6 @@ from darswin.calibrate import Calibration
 from darswin.lens import Lens
 from darswin.viz.plot import HATCH, TEXT, page_figure
 
-__all__ = ["draw_calibration"]
-
 STEPS = 60  # of the map, along the image's longer side
 LONGEST = 0.08  # of the image's width: the arrow of a residual that 95 % do not exceed
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS, Spacing
-from darswin.views import polar_grid
+from darswin.views import PolarView
 
 __all__ = ["describe"]
 
@@ -69,7 +69,9 @@ class Patches(NamedTuple):
 
 def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
     """The sizes of the patches of one lens's partition."""
-    grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
+    grid = PolarView(rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing).grid(
+        lens, (1, 1)
+    )
     borders = grid.borders[0]
     stretch = 1.0 if lens.affine is None else lens.affine[0].det().abs().item()
     # Relative to a circle of radius 1: the squares of lengths in pixels may overflow.

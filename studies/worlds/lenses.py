@@ -16,7 +16,7 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
 
     Args:
         name: one of three kinds. "wide" means perspective lenses of 60° to 90° that fill the
-            square. A name for `darswin.data.parse_lenses` (one ξ, a range, a level of the paper or
+            square. A name for `parse_lenses` (one ξ, a range, a level of the paper or
             "polynomial") gives a lens whose field of view `fov` (rad) fills the circle in the
             square. FILE or FILE:CAMERA is a calibration file; its picture is cut to a square.
 

@@ -1,10 +1,9 @@
 """Records that the tests of the kit share."""
 
 import pytest
-
-from darswin.bench.memory import Memory
-from darswin.bench.record import Record
-from darswin.bench.timing import COMPILED, MATMULS, OURS, REFERENCE, Timing
+from kit.memory import Memory
+from kit.record import Record
+from kit.timing import COMPILED, MATMULS, OURS, REFERENCE, Timing
 
 
 def timing(name, milliseconds, ratio=1.0, target=None, *, mode="inference", batch=8, threads=2):

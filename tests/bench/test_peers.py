@@ -1,10 +1,10 @@
 import peers
 import pytest
 import torch
+from kit.record import Record
+from kit.start import Start
+from kit.timing import OURS, Case
 
-from darswin.bench.record import Record
-from darswin.bench.start import Start
-from darswin.bench.timing import OURS, Case
 from darswin.ops import _module, cpu_capability
 
 

@@ -3,9 +3,8 @@ from pathlib import Path
 import peers
 import pytest
 from figures import on_a_phone
-
-from darswin.bench import plot
-from darswin.bench.record import Record
+from kit import plot
+from kit.record import Record
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 

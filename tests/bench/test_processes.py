@@ -8,9 +8,8 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-
-from darswin.bench import machine, memory, start
-from darswin.bench.timing import OURS
+from kit import machine, memory, start
+from kit.timing import OURS
 
 MB = 2**20
 

@@ -1,7 +1,7 @@
 import json
 
-from darswin.bench.record import Record, write
-from darswin.bench.start import Start
+from kit.record import Record, write
+from kit.start import Start
 
 
 def test_a_record_and_its_plot(record, tmp_path, capsys):

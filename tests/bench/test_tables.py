@@ -1,8 +1,7 @@
 import peers
-
-from darswin.bench import tables
-from darswin.bench.start import Start
-from darswin.bench.tables import BOTH
+from kit import tables
+from kit.start import Start
+from kit.tables import BOTH
 
 
 def test_models(record):
@@ -20,13 +19,6 @@ def test_models(record):
     assert tables.roofline_lines(record) == [
         "darswin_a_small, 64×64, batch 8, inference, float32, 2 threads: matrix products alone "
         "400 GFLOP/s, the model 360 (90%)"
-    ]
-
-
-def test_autotune():
-    row = dict(product="forward", rows=512, in_features=384, out_features=96, threads=2)
-    assert tables.autotune_lines([row | dict(seconds=dict(onednn=0.002, torch=0.005))]) == [
-        "forward, 512 rows, 384 → 96, 2 threads: onednn 2.00 ms; torch 2.50×"
     ]
 
 

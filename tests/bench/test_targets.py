@@ -1,5 +1,5 @@
-from darswin.bench import targets
-from darswin.bench.start import Start
+from kit import targets
+from kit.start import Start
 
 
 def test_targets(record, operators):

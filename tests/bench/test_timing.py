@@ -1,9 +1,8 @@
 import itertools
 
 import pytest
-
-from darswin.bench import timing
-from darswin.bench.timing import DEFAULT, OURS, PACE, Case, Turn, in_turns, measure, measure_paced
+from kit import timing
+from kit.timing import DEFAULT, OURS, PACE, Case, Turn, in_turns, measure, measure_paced
 
 
 @pytest.fixture

@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from darswin.cli import bench as command
 from darswin.cli import lens, predict, quantize
 from darswin.cli.arguments import run_command, with_lists
 from darswin.cli.main import main
-from darswin.compat import convert_checkpoint
+from darswin.compat.checkpoint import convert_checkpoint
 
 
 @pytest.mark.parametrize(
@@ -118,40 +117,27 @@ def test_wrong_arguments_are_one_sentence(capsys, typed, said):
         (["convert"], "the following arguments are required: source, target"),
         (["convert", "none.pth", "out.safetensors"], "No such file or directory: 'none.pth'"),
         (["convert", "a", "b", "--fast"], "unrecognized arguments: --fast"),
-        (["bench", "--size", "0"], "--size must be from 1 to 65536, got 0"),
-        (["bench", "--size=-1"], "--size must be from 1 to 65536, got -1"),
-        (["bench", "--batches", "1,x"], "--batches must be whole numbers, such as 1,8, got 1,x"),
-        (["bench", "--batches"], "--batches must have at least one number"),
-        (["bench", "--seconds", "nan"], "--seconds must be above 0, got nan"),
-        (["bench", "--model", "swan"], "unknown model 'swan'"),
-        (["bench", "--out", __file__], "File exists"),
         (["train"], "no command 'train'. The commands are fit, "),
         (["lents"], "no command 'lents'; did you mean lens? The commands are fit, "),
     ],
 )
-def test_misuse_ends_with_a_sentence_before_any_work(capsys, monkeypatch, argv, said):
-    monkeypatch.setattr(command, "machine", lambda: pytest.fail("it was refused too late"))
+def test_misuse_ends_with_a_sentence_before_any_work(capsys, argv, said):
     with pytest.raises(SystemExit) as end:
         main(argv)
     assert end.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
 
 
 WORDS = st.sampled_from(
-    ["models", "bench", "convert", "--size", "--batches", "--compiled", "--seconds", "--out",
-     "--model", "--config", "--foo", "-x", "-", "--", "", "0", "-1", "9" * 5000, "1e300", "nan",
-     "[", "[]", "1,,2", ",", "x", ".", "/dev/null", "\ud800", "²", "source", "=", "--size="]
+    ["models", "convert", "--size", "--out", "--config", "--foo", "-x", "-", "--", "", "0",
+     "-1", "9" * 5000, "1e300", "nan", "[", "[]", "1,,2", ",", "x", ".", "/dev/null", "\ud800",
+     "²", "source", "=", "--size="]
 )  # fmt: skip
 
 
-def stop():
-    raise OSError("the benchmark would begin")
-
-
-@given(st.sampled_from(["models", "bench", "convert"]), st.lists(WORDS, max_size=5))
+@given(st.sampled_from(["models", "convert"]), st.lists(WORDS, max_size=5))
 def test_any_arguments_end_with_an_answer_or_a_sentence(tmp_path_factory, name, words):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.getbasetemp())
-        patch.setattr(command, "machine", stop)
         try:
             main([name, *words])
         except SystemExit as end:
@@ -162,7 +148,6 @@ HELPED = {
     "predict": predict.predict,
     "quantize": quantize.quantize,
     "convert": convert_checkpoint,
-    "bench": command.bench,
     **{f"lens {name}": function for name, function in lens.COMMANDS.items()},
 }
 

@@ -14,7 +14,6 @@ from scenes import CALIBRATIONS, write_plain
 
 from darswin.cli.main import COMMANDS, main
 from darswin.cli.options import PRESETS, complete, flag_of
-from darswin.layers import linear
 from darswin.models import load_model
 from darswin.train import data
 from darswin.train.tasks import TASKS
@@ -156,13 +155,10 @@ def test_a_run_is_not_overwritten(capsys, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_run_s_options_and_checkpoints_of_other_models(capsys, tmp_path):
-    linear._measured.clear()
-    backend = ["--model.matmul_backend", "autotune", "--model.grad_checkpointing", "true"]
+    backend = ["--model.matmul_backend", "onednn", "--model.grad_checkpointing", "true"]
     fit(tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48", *backend)
-    products = {shape.product for shape in linear.autotune_results()}
-    assert products == {"forward", "input gradient", "weight gradient"}
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())["model"]
-    assert saved["matmul_backend"] == "autotune" and saved["grad_checkpointing"] is True
+    assert saved["matmul_backend"] == "onednn" and saved["grad_checkpointing"] is True
     test = ["test", "--run", tmp_path]
     message = error(capsys, *test, "--model.options", "{embed_dim: 12}")
     assert "another model" in message and "embed_dim None there, 12 here" in message

@@ -309,7 +309,7 @@ def test_errors_show_names_of_files_as_they_are(tmp_path, capsys):
         ("predict x.png --calib_lenses x --evry 2", "the nearest option is --every; see"),
         ("predict x.png --lenz x --evry=2", "the nearest option is --lens, --every; see"),
         ("quantize --run r --tolerence 2", "the nearest option is --tolerance; see"),
-        ("bench --zzzzzz 2", "unrecognized arguments: --zzzzzz 2; see `darswin bench --help`"),
+        ("models --zzzzzz 2", "unrecognized arguments: --zzzzzz 2; see `darswin models --help`"),
     ],
 )
 def test_misspelt_options_are_answered_with_the_nearest(capsys, command, said):

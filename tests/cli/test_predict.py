@@ -23,7 +23,7 @@ from darswin.compat import load_official
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Spherical, from_dict, load, save
 from darswin.lens.orientation import in_upright_picture
-from darswin.models import pretrained_file
+from darswin.models.registry import pretrained_file
 from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.utils.video import read_frames
 

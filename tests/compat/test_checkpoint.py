@@ -14,7 +14,8 @@ from helpers import fixture
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from darswin.compat import convert_checkpoint, load_official, read_state
+from darswin.compat import load_official
+from darswin.compat.checkpoint import convert_checkpoint, read_state
 
 
 class CfgNode(dict):

@@ -10,9 +10,10 @@ from PIL import ExifTags, Image
 from pngs import PALETTE, png
 from scenes import write, write_plain
 
-from darswin.data import Calibrated, Calibrations, SceneSamples, open_scenes, open_source
+from darswin.data import Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
+from darswin.data.samples import Calibrated
 from darswin.data.scenes.targets import OddLabels
 from darswin.data.wide_angle import WideAngle
 from darswin.utils import image

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from darswin.data.warping import remap
 from frames import CALIBRATIONS, WOODSCAPE, write_frames
 from helpers import slow_but
 from PIL import ExifTags, Image
@@ -14,7 +15,6 @@ from torch.utils.data import DataLoader
 
 from darswin.data import (
     IGNORE,
-    Calibrated,
     Calibrations,
     RandAugment,
     RandomTurns,
@@ -28,8 +28,7 @@ from darswin.data import (
 )
 from darswin.data.order import TrainingOrder
 from darswin.data.pictures import Arrays
-from darswin.data.samples import Draw
-from darswin.data.warping import remap
+from darswin.data.samples import Calibrated, Draw
 from darswin.lens import Equidistant, Spherical, Tabulated, load
 from darswin.lens.orientation import in_upright_picture
 from darswin.utils.image import BrokenImageError, read_oriented

@@ -257,6 +257,15 @@ def test_8_bits_without_vnni(monkeypatch):
         _module.allow_fours(True)
 
 
+def test_the_best_of_some_turns_counts_but_not_the_first(monkeypatch):
+    times = iter([0, 0, 0, 3, 3, 7, 7, 9, 9, 16])  # seconds: 3 and 4, then 2 and 7
+    monkeypatch.setattr(packed.time, "perf_counter", lambda: next(times))
+    calls = []
+    runs = dict(a=lambda: calls.append("a"), b=lambda: calls.append("b"))
+    assert packed.best_seconds(runs, turns=3) == dict(a=2, b=4)
+    assert calls == ["a", "b"] * 3
+
+
 def test_fastest_dtype_is_measured(monkeypatch):
     packed.fastest_dtype.cache_clear()
     state = torch.get_rng_state()

@@ -7,7 +7,6 @@ parsers.
 """
 
 import ast
-import functools
 import importlib.util
 import json
 import re
@@ -29,7 +28,6 @@ from scenes import write_outlines, write_plain, write_woodscape
 from videos import write_video
 
 from darswin import frames, lens
-from darswin.cli.bench import bench
 from darswin.cli.main import main
 from darswin.viz.report import largest_offset
 
@@ -143,9 +141,6 @@ def commands(text: str) -> list[list[str]]:
 
 
 def run_darswin(arguments: list[str], monkeypatch) -> None:
-    """Runs a command; `bench` is only parsed."""
-    parsed = functools.wraps(bench)(lambda **options: None)
-    monkeypatch.setattr("darswin.cli.bench.bench", parsed)
     command, *options = arguments
     main([command, *options, *(QUICK if command == "fit" else ())])
 

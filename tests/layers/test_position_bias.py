@@ -4,11 +4,10 @@ from typing import get_args
 import pytest
 import torch
 
-from darswin import polar_grid
+from darswin import PolarView
 from darswin.layers.position_bias import AngularRelativeBias, FourierBias, ring_angles
 from darswin.lens import Spherical
 from darswin.lens.spacing import Spacing
-from darswin.views import PolarView
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -52,7 +51,7 @@ def test_periodic_bias_joins_at_the_seam():
 
 
 def test_radial_positions():
-    grid = polar_grid(LENS, (32, 32), rings=8, sectors=4, samples=(2, 2))
+    grid = PolarView(rings=8, sectors=4, samples=(2, 2)).grid(LENS, (32, 32))
     angles = ring_angles(LENS.theta_max, grid, 4, "angular_relative")
     torch.testing.assert_close(angles[0], torch.linspace(0, 1.3, 5))
     radii = ring_angles(LENS.theta_max, grid, 4, "polar")
@@ -63,7 +62,7 @@ def test_radial_positions():
 def test_the_angles_of_the_bias_do_not_follow_the_spacing(spacing):
     """docs/explanation/spacings.md tells that they are nominal."""
     options = dict(rings=8, sectors=4, samples=(2, 2), spacing=spacing)
-    grid = polar_grid(LENS, (32, 32), **options)
+    grid = PolarView(**options).grid(LENS, (32, 32))
     angles = ring_angles(LENS.theta_max, grid, 8, "angular")
     torch.testing.assert_close(angles, LENS.theta_max[:, None] * torch.linspace(0, 1, 9))
     borders = PolarView(**options).border_angles(LENS)

@@ -15,9 +15,9 @@ from darswin.lens import (
     Spherical,
     Stereographic,
     Tabulated,
-    as_curves,
     cat,
 )
+from darswin.lens.curves import as_curves
 
 
 def alone(name, camera=None):

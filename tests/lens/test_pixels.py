@@ -16,7 +16,6 @@ from darswin.lens import (
     Spherical,
     distance_to_z,
     reproject,
-    solid_angles,
     z_to_distance,
 )
 from darswin.lens.pixels import (
@@ -26,6 +25,7 @@ from darswin.lens.pixels import (
     pixel_rays,
     ray_channels,
     reprojection,
+    solid_angles,
 )
 
 f64 = torch.float64

@@ -10,7 +10,7 @@ from lens_examples import RANGES, f64, first_coefficients
 
 from darswin.lens import MODELS, cat, from_dict, to_dict
 from darswin.lens.spacing import SPACINGS
-from darswin.views.polar import PLACEMENTS, polar_grid
+from darswin.views.polar import PLACEMENTS, PolarView
 
 
 def rows(draw, low, high, count, width):
@@ -129,10 +129,14 @@ def test_samples_of_any_grid_stand_in_their_patches(lens, rings, sectors, data):
     spacings = st.sampled_from([s for s in SPACINGS if narrow or s != "tan"])
     spacing, inner = data.draw(spacings), data.draw(spacings)
     hypothesis.assume(type(lens).__name__ != "OCamInverse" or "radius" not in (spacing, inner))
-    grid = polar_grid(
-        lens, (480, 640), rings=rings, sectors=sectors, samples=samples, spacing=spacing,
-        sample_spacing=inner, placement=placement,
-    )  # fmt: skip
+    grid = PolarView(
+        rings=rings,
+        sectors=sectors,
+        samples=samples,
+        spacing=spacing,
+        sample_spacing=inner,
+        placement=placement,
+    ).grid(lens, (480, 640))
     slack = 1e-6 * (1 + lens.r_max[:, None, None])
     assert grid.radii.shape == (len(lens), rings * samples[0])
     assert grid.borders.shape == (len(lens), rings + 1)

@@ -14,7 +14,8 @@ from lens_examples import ASIDE, FILES, assert_projects, double, example, f64, p
 from torch.testing import assert_close
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Spherical, as_curves, load, load_all, save
+from darswin.lens import MODELS, Spherical, load, load_all, save
+from darswin.lens.curves import as_curves
 
 FORMATS = {"opencv": (".yaml", ".xml", ".json"), "colmap": (".txt",), "kalibr": (".yaml",)}
 

@@ -9,25 +9,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from darswin.data.warping import remap
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
 from darswin.cli.predict import predict
 from darswin.data import at_size, warp_map
-from darswin.data.warping import remap
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load
-from darswin.models import (
-    ModelCard,
-    create_model,
-    list_models,
-    list_pretrained,
-    load_model,
-    pretrained_file,
-    read_card,
-)
-from darswin.models.registry import model_class, preset
+from darswin.models import ModelCard, create_model, list_models, load_model
+from darswin.models.registry import list_pretrained, model_class, preset, pretrained_file
+from darswin.models.saving import read_card
 from darswin.train.classification import Classification
 
 ROOT = Path(__file__).parents[2]

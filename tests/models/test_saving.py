@@ -85,11 +85,11 @@ def test_options_of_a_wrong_kind_are_refused_in_a_sentence(option, weights, tmp_
             refusal(path)
 
 
-def test_an_older_file_lacks_what_came_later(weights, tmp_path):
-    path, older = tmp_path / "m.safetensors", dict(vars(CARD))
-    del older["fit"]
-    save_file(weights, path, metadata={"darswin": json.dumps(older)})
-    assert load_model(path)[1] == CARD and CARD.fit == "whole"
+def test_a_card_without_a_field_is_refused(weights, tmp_path):
+    path, shorter = tmp_path / "m.safetensors", dict(vars(CARD))
+    del shorter["fit"]
+    save_file(weights, path, metadata={"darswin": json.dumps(shorter)})
+    assert refusal(path).endswith("its model card lacks fit")
 
 
 def test_a_card_shows_the_normalization():

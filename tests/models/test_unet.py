@@ -7,13 +7,12 @@ import torch
 import torch.nn.functional as F
 from helpers import network
 
-from darswin import create_model, polar_grid
+from darswin import PolarView, create_model
 from darswin.layers.transformer import PatchMerging
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.models.pixel import DistanceHead, PixelHead
 from darswin.models.unet import PatchExpand, SkipJoin, Unet
 from darswin.ops import polar_to_image
-from darswin.views import PolarView
 
 f64 = torch.float64
 NANO = dict(depths=(1, 2, 1))  # of the classifiers of that size
@@ -30,8 +29,9 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
     back = model.prepare(lens, (64, 64)).view.back
-    grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
-                      sample_spacing="radius")  # fmt: skip
+    grid = PolarView(
+        rings=16, sectors=64, samples=(4, 4), spacing=spacing, sample_spacing="radius"
+    ).grid(lens, (64, 64))
     torch.testing.assert_close(back.radii, grid.radii)
     assert torch.equal(back.center, grid.center) and torch.equal(back.r_max, lens.r_max)
     # In `polar_to_image`, the azimuth of sector a is that of the samples of column a.

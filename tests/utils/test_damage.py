@@ -10,8 +10,10 @@ from helpers import slow_but
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from darswin.compat import convert_checkpoint, read_state
-from darswin.models import ModelCard, load_model, pretrained_file, read_card, save_model
+from darswin.compat.checkpoint import convert_checkpoint, read_state
+from darswin.models import ModelCard, load_model, save_model
+from darswin.models.registry import pretrained_file
+from darswin.models.saving import read_card
 from darswin.train.runs import SafeCheckpointIO
 from darswin.utils.tensor_files import read_metadata, read_tensors, write_tensors
 from darswin.utils.unpickle import read_pickle

@@ -12,7 +12,7 @@ from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS
 from darswin.ops import polar_sample, polar_to_image
-from darswin.views import PolarView, polar_grid
+from darswin.views import PolarView
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -37,7 +37,7 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
     ],
 )
 def test_ring_borders_in_pixels(xi, spacing, radii):
-    borders = polar_grid(spherical(xi), (64, 64), **SIZES, spacing=spacing).borders
+    borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders
     got = borders[0, [1, 2, 4, 8, 12, 15]]
     torch.testing.assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
     assert borders[0, 0] == 0
@@ -55,7 +55,7 @@ def test_ring_borders_in_pixels(xi, spacing, radii):
 )  # fmt: skip
 def test_ring_borders_in_degrees(spacing, degrees):
     lens = spherical(0.3, math.radians(175))
-    borders = polar_grid(lens, (64, 64), **SIZES, spacing=spacing).borders
+    borders = PolarView(**SIZES, spacing=spacing).grid(lens, (64, 64)).borders
     got = torch.rad2deg(lens.unproject(borders))[0, : len(degrees)]
     torch.testing.assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
 
@@ -63,10 +63,14 @@ def test_ring_borders_in_degrees(spacing, degrees):
 @pytest.mark.parametrize("sample_spacing", SPACINGS)
 def test_sample_spacing_splits_each_ring_equally(sample_spacing):
     lens = spherical(0.4, 2.8)
-    grid = polar_grid(
-        lens, (64, 64), rings=4, sectors=4, samples=(6, 2), spacing="theta",
-        sample_spacing=sample_spacing, placement="edges",
-    )  # fmt: skip
+    grid = PolarView(
+        rings=4,
+        sectors=4,
+        samples=(6, 2),
+        spacing="theta",
+        sample_spacing=sample_spacing,
+        placement="edges",
+    ).grid(lens, (64, 64))
     theta = lens.unproject(grid.radii)
     measure = {
         "theta": lambda t: t,
@@ -87,22 +91,24 @@ def test_sample_spacing_splits_each_ring_equally(sample_spacing):
 def test_works_beyond_90_degrees_except_for_tan():
     lens = Polynomial([350.4, -17.5, 27.5, -2.4], math.radians(112))
     for spacing in ("theta", "radius", "g"):
-        grid = polar_grid(lens, (966, 1280), **SIZES, spacing=spacing)
+        grid = PolarView(**SIZES, spacing=spacing).grid(lens, (966, 1280))
         assert grid.radii.isfinite().all() and (grid.borders.diff(dim=1) > 0).all()
     wide = Spherical(0.9, 30.0, math.pi / 2)
     for options in (dict(spacing="tan"), dict(spacing="theta", sample_spacing="tan")):
         for one in (lens, wide):
             with pytest.raises(ValueError, match=r"spacing='tan' needs .* below 90°.*got \d+\.\d°"):
-                polar_grid(one, (966, 1280), **SIZES, **options)
+                PolarView(**SIZES, **options).grid(one, (966, 1280))
 
 
 def test_center_and_batch():
     lens = Perspective([10.0, 20.0], 1.0, center=[[3.0, 4.0], [5.0, 6.0]])
-    grid = polar_grid(lens, (48, 64), **SIZES)
+    grid = PolarView(**SIZES).grid(lens, (48, 64))
     assert grid.center.tolist() == [[3.0, 4.0], [5.0, 6.0]]
     torch.testing.assert_close(grid.radii[1], 2 * grid.radii[0])
-    assert polar_grid(Perspective(10.0, 1.0), (48, 64), **SIZES).center.tolist() == [[31.5, 23.5]]
-    empty = polar_grid(lens[:0], (48, 64), **SIZES, spacing="tan")
+    assert PolarView(**SIZES).grid(Perspective(10.0, 1.0), (48, 64)).center.tolist() == [
+        [31.5, 23.5]
+    ]
+    empty = PolarView(**SIZES, spacing="tan").grid(lens[:0], (48, 64))
     assert empty.radii.shape == (0, 160)
 
 
@@ -114,10 +120,13 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
     theta_max = torch.tensor([1.2, 1.3], dtype=f64, requires_grad=True)
 
     def radii(xi, focal, theta_max):
-        return polar_grid(
-            Spherical(xi, focal, theta_max), (64, 64), rings=3, sectors=4, samples=(3, 2),
-            spacing=spacing, sample_spacing=sample_spacing,
-        ).radii  # fmt: skip
+        return (
+            PolarView(
+                rings=3, sectors=4, samples=(3, 2), spacing=spacing, sample_spacing=sample_spacing
+            )
+            .grid(Spherical(xi, focal, theta_max), (64, 64))
+            .radii
+        )
 
     assert torch.autograd.gradcheck(radii, (xi, focal, theta_max))
 
@@ -163,7 +172,7 @@ def camera(**aside):
 )
 def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
     lens = camera(**aside)
-    grid = polar_grid(lens, (1400, 1400), **SIZES, spacing=spacing)
+    grid = PolarView(**SIZES, spacing=spacing).grid(lens, (1400, 1400))
     direction = torch.stack((torch.cos(grid.azimuths), torch.sin(grid.azimuths)), -1)
     around = grid.radii[0, :, None, None] * direction
     matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
@@ -219,7 +228,7 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
 def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
     lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
     rays = PolarView(4, 8, (1, 1), spacing=spacing).token_rays(lens)
-    grid = polar_grid(lens, (64, 64), rings=4, sectors=8, samples=(1, 1), spacing=spacing)
+    grid = PolarView(rings=4, sectors=8, samples=(1, 1), spacing=spacing).grid(lens, (64, 64))
     x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
     pixels = torch.stack((x, y), -1) + grid.center[0]
     torch.testing.assert_close(rays, lens.unproject_points(pixels[None]))
@@ -233,7 +242,7 @@ LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
     images = torch.randn(2, 3, 32, 33)
     sample = PolarView(4, 8, (3, 2), spacing="tan", layout="image")
-    grid = polar_grid(LENSES, (32, 33), rings=4, sectors=8, samples=(3, 2), spacing="tan")
+    grid = PolarView(rings=4, sectors=8, samples=(3, 2), spacing="tan").grid(LENSES, (32, 33))
     x = grid.center[:, 0, None, None] + grid.radii[:, :, None] * torch.cos(grid.azimuths)
     y = grid.center[:, 1, None, None] + grid.radii[:, :, None] * torch.sin(grid.azimuths)
     mesh = torch.stack((2 * x / 32 - 1, 2 * y / 31 - 1), -1)

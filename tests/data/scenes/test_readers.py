@@ -27,8 +27,9 @@ from scenes import (
 )
 from torch.utils.data import DataLoader
 
-from darswin.data import IGNORE, LeftOut, SceneSamples, open_scenes
+from darswin.data import IGNORE, SceneSamples, open_scenes
 from darswin.data.scenes.woodscape import heal_swin
+from darswin.data.splits import LeftOut
 from darswin.lens import KannalaBrandt, Mei, load, save
 
 INFO = "semantic_annotations/seg_annotation_info.json"

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from darswin.bench.memory import Memory, compared
-from darswin.bench.start import Start
-from darswin.bench.timing import (
+from kit.memory import Memory, compared
+from kit.start import Start
+from kit.timing import (
     COMPILED,
     COMPILED_BFLOAT16,
     MATMULS,

@@ -8,22 +8,21 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from darswin.bench.memory import Memory
-from darswin.bench.start import Start
-from darswin.bench.timing import Timing
 from darswin.utils.files import replace_file
+from kit.memory import Memory
+from kit.start import Start
+from kit.timing import Timing
 
 
 @dataclass
 class Record:
     """The results of one run of a benchmark."""
 
-    machine: dict  # of `darswin.bench.machine`
+    machine: dict  # of `kit.machine`
     timings: list[Timing]
     memory: list[Memory] = field(default_factory=list)
     starts: list[Start] = field(default_factory=list)  # of programs without torch
     operations: int = 0  # of floating point, in a model's matrix products for one image
-    autotune: list[dict] = field(default_factory=list)  # rows of `autotune_results`
 
     def save(self, path: Path) -> None:
         content = asdict(self, dict_factory=_known)

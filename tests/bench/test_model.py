@@ -1,10 +1,10 @@
+import model
 import pytest
 import torch
-
-from darswin.bench import candidates, tables, targets
-from darswin.bench.memory import Memory
-from darswin.bench.record import Record
-from darswin.bench.timing import (
+from kit import candidates, tables, targets
+from kit.memory import Memory
+from kit.record import Record
+from kit.timing import (
     COMPILED,
     FIXED_LENS,
     MATMULS,
@@ -13,24 +13,24 @@ from darswin.bench.timing import (
     OURS_FLOAT32,
     REFERENCE,
 )
-from darswin.cli import bench as command
-from darswin.cli.main import main
+
+from darswin.cli.arguments import run_command
 from darswin.layers.linear import onednn_lack
 from darswin.models import DarSwin
 
 
 @pytest.mark.slow
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(command, "THREADS", [1])
+    monkeypatch.setattr(model, "THREADS", [1])
     measured = set()
 
     def measure(mode, model, size, dtype, batch, name, threads):
         measured.add((mode, dtype, name))
         return Memory(f"{mode}, {dtype}", batch, name, 1, 2, 3)
 
-    monkeypatch.setattr(command.memory, "measure", measure)
-    options = ["--model", "darswin_a_nano", "--size", "32", "--batches", "1", "2"]
-    main(["bench", *options, "--seconds", "0.01", "--compiled", "--out", str(tmp_path)])
+    monkeypatch.setattr(model.memory, "measure", measure)
+    options = "--model darswin_a_nano --size 32 --batches 1 2 --seconds 0.01 --compiled --out"
+    run_command(model.bench, [*options.split(), str(tmp_path)], "model.py")
     (path,) = tmp_path.glob("model--*.json")
     assert path.with_suffix(".png").exists()
     record = Record.load(path)
@@ -50,34 +50,47 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
         expected |= {(f"{mode}, {dtype}", batch): names for batch in (1, 2)}
     assert found == expected
     assert measured == {(*both_of, name) for both_of in both for name in (OURS, REFERENCE)}
-    assert {row["product"] for row in record.autotune} == {
-        "forward", "input gradient", "weight gradient",
-    }  # fmt: skip
     printed = capsys.readouterr().out
     assert tables.models_table(record.timings) in printed and str(path) in printed
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (dict(size=0), "`size` must be from 1 to 65536, got 0"),
+        (dict(batches=[-1]), "`batches` must be from 1 to 65536, got -1"),
+        (dict(batches=[]), "--batches must have at least one number"),
+        (dict(seconds=float("nan")), "`seconds` must be above 0, got nan"),
+        (dict(model="swan"), "unknown model 'swan'"),
+    ],
+)
+def test_wrong_options_are_refused_before_any_work(monkeypatch, tmp_path, options, words):
+    monkeypatch.setattr(model, "machine", lambda: pytest.fail("it was refused too late"))
+    with pytest.raises(ValueError, match=words):
+        model.bench(**options, out=tmp_path)
 
 
 @pytest.mark.slow
 def test_targets_are_for_all_threads(monkeypatch):
     monkeypatch.setattr(targets, "MODEL", "darswin_a_nano")
-    monkeypatch.setattr(command, "THREADS", [1, 2])
+    monkeypatch.setattr(model, "THREADS", [1, 2])
     arguments = ("darswin_a_nano", 64, 8, 1e-3, False)
-    with command.num_threads(2):
-        found = command._measure("inference", "float32", *arguments)
+    with model.num_threads(2):
+        found = model._measure("inference", "float32", *arguments)
     wanted = {t.name: t.target for t in found}
     assert wanted == {OURS: None, FIXED_LENS: None, MATMULS: 0.8, REFERENCE: 2.6}
-    with command.num_threads(1):
-        assert not any(t.target for t in command._measure("inference", "float32", *arguments))
+    with model.num_threads(1):
+        assert not any(t.target for t in model._measure("inference", "float32", *arguments))
 
 
 @pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
 def test_the_matrix_products_are_all_of_the_model(name):
-    model, lens = candidates.network(name, 32).eval(), candidates.lens_of(32)
-    products = candidates.matmuls_of(model, torch.randn(2, 3, 32, 32), lens, torch.float32)
-    layers = [m for m in model.modules() if isinstance(m, torch.nn.Linear)]
+    net, lens = candidates.network(name, 32).eval(), candidates.lens_of(32)
+    products = candidates.matmuls_of(net, torch.randn(2, 3, 32, 32), lens, torch.float32)
+    layers = [m for m in net.modules() if isinstance(m, torch.nn.Linear)]
     sizes = sorted((m.in_features, m.out_features) for m in layers)
     assert sorted((x.shape[-1], product(x).shape[-1]) for product, x in products) == sizes
-    if isinstance(model, DarSwin):
+    if isinstance(net, DarSwin):
         # Tokens of the embedding, of three stages' blocks with twelve squares of their width each.
         tokens, widths, depths = (256, 64, 16), (24, 48, 96), (1, 2, 1)
         expected = 256 * 4 * 4 * 3 * 24 + 96 * 200
@@ -88,9 +101,9 @@ def test_the_matrix_products_are_all_of_the_model(name):
 
 def test_candidates_that_disagree_are_not_timed():
     runs = {OURS: lambda: torch.ones(3), REFERENCE: lambda: torch.ones(3) + 1e-3}
-    command._check(runs | {MATMULS: lambda: torch.zeros(1)}, 1e-2)
+    model._check(runs | {MATMULS: lambda: torch.zeros(1)}, 1e-2)
     with pytest.raises(RuntimeError, match="darswin differs from the reference"):
-        command._check(runs, 1e-4)
+        model._check(runs, 1e-4)
 
 
 def test_the_reference_is_compiled_with_freezing(monkeypatch):
@@ -103,4 +116,4 @@ def test_the_reference_is_compiled_with_freezing(monkeypatch):
     monkeypatch.setattr(torch, "compile", compiled)
     runs = candidates.inference("darswin_a_nano", 32, torch.float32, 2, compiled=True)
     assert COMPILED in runs and asked == [dict(options={"freezing": True}, dynamic=False)]
-    command._check(runs, 1e-4)
+    model._check(runs, 1e-4)

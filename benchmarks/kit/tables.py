@@ -1,12 +1,12 @@
 """Measurements as tables in Markdown; "a / b" means at one and at all threads."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
-from darswin.bench.memory import Memory, compared
-from darswin.bench.record import Record
-from darswin.bench.start import Start
-from darswin.bench.timing import (
+from kit.memory import Memory, compared
+from kit.record import Record
+from kit.start import Start
+from kit.timing import (
     COMPILED,
     COMPILED_BFLOAT16,
     FIXED_LENS,
@@ -133,17 +133,4 @@ def roofline_lines(record: Record) -> list[str]:
             work = 1e-9 * record.operations * t.batch * products
             rates = f"{work / t.median:.0f} GFLOP/s, the model {work / ours[t.label]:.0f}"
             lines.append(f"{t.label}: {t.name} {rates} ({t.ratio:.0%})")
-    return lines
-
-
-def autotune_lines(autotune: Iterable[Mapping]) -> list[str]:
-    """The fastest backend of each matrix product in training, and the ratios of the others."""
-    lines = []
-    for row in autotune:
-        best, *others = row["seconds"].items()
-        over = ", ".join(f"{name} {seconds / best[1]:.2f}×" for name, seconds in others)
-        lines.append(
-            f"{row['product']}, {row['rows']} rows, {row['in_features']} → {row['out_features']}, "
-            f"{row['threads']} threads: {best[0]} {1e3 * best[1]:.2f} ms; {over}"
-        )
     return lines

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from darswin.bench.record import Record
-from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
+from kit.record import Record
+from kit.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""The peak memory of a batch, measured in its own process, which runs this file."""
+"""The peak memory of a batch, measured in its own process, which runs this module."""
 
 import json
 import subprocess
@@ -9,10 +9,12 @@ from pathlib import Path
 
 import torch
 
-from darswin.bench import candidates
-from darswin.bench.timing import OURS, REFERENCE
+from darswin.layers.linear import MatmulBackend
 from darswin.utils.malloc import give_back_memory
+from kit import candidates
+from kit.timing import OURS, REFERENCE
 
+BENCHMARKS = Path(__file__).parents[1]
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
@@ -59,8 +61,8 @@ def measure(
 ) -> Memory:
     """Measures `OURS` or `REFERENCE` in a new process."""
     arguments = map(str, (mode, model, size, dtype, batch, name, threads))
-    command = [sys.executable, "-m", "darswin.bench.memory", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True)
+    command = [sys.executable, "-m", "kit.memory", *arguments]
+    done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"the peak memory of {name} cannot be measured: {done.stderr.strip()}")
     return Memory(**json.loads(done.stdout.splitlines()[-1]))
@@ -78,7 +80,8 @@ def _measure_here(
     before = _resident("VmRSS")
     pixels, kind, reference = int(size), getattr(torch, dtype), name == REFERENCE
     if mode == "training":
-        run = candidates.training_step(model, pixels, kind, int(batch), reference=reference)
+        backend: MatmulBackend | None = None if reference else "torch"
+        run = candidates.training_step(model, pixels, kind, int(batch), backend)
     else:
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)

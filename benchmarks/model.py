@@ -1,16 +1,20 @@
-"""The command `darswin bench`."""
+"""A whole model, compared with the PyTorch reference and with the matrix products alone.
 
+`make bench`, or `python benchmarks/model.py [OPTIONS]`, whose `--help` lists the options.
+"""
+
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from kit import candidates, memory, plot, tables, targets
+from kit.machine import THREADS, machine, num_threads
+from kit.record import Record
+from kit.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
 from torch import Tensor
 
-from darswin.bench import candidates, memory, plot, tables, targets
-from darswin.bench.machine import THREADS, machine, num_threads
-from darswin.bench.record import Record
-from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
-from darswin.layers import linear
+from darswin.cli.arguments import run_command
 from darswin.models.registry import model_class
 from darswin.utils.malloc import keep_freed_memory
 from darswin.utils.parameters import check
@@ -34,7 +38,7 @@ def bench(
 ) -> Record:
     """Measures the speed of inference and training of a model on this machine.
 
-    With the default options this takes a quarter of an hour. The command prints tables, and writes
+    With the default options this takes a quarter of an hour. The program prints tables, and writes
     a record and a plot.
 
     Args:
@@ -69,12 +73,7 @@ def bench(
         timings=timings,
         memory=_memory(model, size, 8) if memory.available() else [],
         operations=candidates.operations_of(model, size),
-        autotune=[
-            dict(shape._asdict(), seconds=seconds)
-            for shape, seconds in linear.autotune_results().items()
-        ],
     )
-    print(*tables.autotune_lines(record.autotune), "", sep="\n")
     print(tables.models_table(timings), "", tables.quantized_table(timings), "", sep="\n")
     print(tables.memory_table(record.memory), "", sep="\n")
     print(*tables.roofline_lines(record), "", *targets.lines(timings), sep="\n")
@@ -129,3 +128,7 @@ def _memory(model: str, size: int, batch: int) -> list[memory.Memory]:
         for dtype in DTYPES
         for name in (OURS, REFERENCE)
     ]
+
+
+if __name__ == "__main__":
+    run_command(bench, sys.argv[1:], "python benchmarks/model.py")
