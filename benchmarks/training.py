@@ -25,7 +25,7 @@ from darswin.ops import use_reference
 from darswin.train.classification import Classification
 from darswin.train.data import WideAngleData
 
-FAMILIES = ("darswin_a", "darswin_ra", "swin", "swin_undis", "dat")
+FAMILIES = ("darswin_a", "darswin_ra", "swin", "dat")
 WARM_UP = 3  # steps before the measurement
 
 

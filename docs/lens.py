@@ -19,7 +19,7 @@ from PIL import Image
 from darswin import PolarView
 from darswin.lens import Polynomial
 from darswin.utils.files import replace_file
-from darswin.views import TangentView
+from darswin.views import PerspectiveView
 from darswin.viz.plot import TEXT, draw_grid, draw_lens, draw_polar, page_figure, save_figure
 
 DOCS = Path(__file__).parent
@@ -91,7 +91,7 @@ def main() -> None:
     replace_file(EXAMPLES / "front.jpg", picture.getvalue())
     calibration = dict(zip(("k1", "k2", "k3", "k4"), COEFFICIENTS, strict=True)) | OFFSETS
     replace_file(EXAMPLES / "front.json", json.dumps({"intrinsic": calibration}, indent=2) + "\n")
-    view = TangentView((604, 800), fov=math.radians(110))
+    view = PerspectiveView((604, 800), fov=math.radians(110))
     sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")
     save_figure(figure, DOCS / "lens.png", colors=256)

@@ -16,7 +16,7 @@ from darswin.viz.plot import TEXT, page_figure, save_figure
 ROOT = Path(__file__).parent.parent
 SIDE = 240  # px
 SINGLE = ("square", "perspective", "stereographic", "equirectangular", "cylindrical", "mercator",
-          "tangent")  # fmt: skip
+          "panorama")  # fmt: skip
 
 
 def draw_views() -> Figure:

@@ -1,5 +1,6 @@
 """The cells of the study: a model and the lenses on which it is trained."""
 
+import math
 from dataclasses import dataclass, field
 
 LEVELS = ("very low", "low", "medium", "high")
@@ -9,6 +10,9 @@ POLYNOMIAL = "polynomial"
 # The released code spaces rings and samples by tan θ, so the paper's numbers need it too; see
 # docs/explanation/spacings.md.
 DARSWIN = dict(spacing="tan", samples=[10, 10])
+# A perspective view of all that a lens sees, up to 175°.
+END = math.radians(87.5)
+UNDISTORTED = dict(name="perspective", reach=END, theta_max=END, reads=1)
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class Cell:
 MODELS = {
     "DarSwin-A": ("darswin_a", DARSWIN),
     "DAT": ("dat", {}),
-    "Swin (undis)": ("swin_undis", {}),
+    "Swin (undis)": ("swin", dict(view=UNDISTORTED)),
     "Swin": ("swin", {}),
 }
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 
+from cells import UNDISTORTED
 from dense_data import SHUFFLED
 from jobs import key_of
 
@@ -11,8 +12,8 @@ THROUGH_ANY = ("--data.lens_augmentation", "0..1")
 
 # The same view for all lenses: 4.2 rad (241°) wide, so that it shows all of the pictures of lenses
 # of 165°. It has as many pixels as the picture, to 2 %. Windows divide the maps of all stages.
-MERCATOR = dict(view="mercator", fov=4.2, size=[144, 112])
-EQUIRECTANGULAR = dict(view="equirectangular", fov=4.2, size=[112, 144])
+MERCATOR = dict(view=dict(name="mercator", fov=4.2, size=[144, 112]))
+EQUIRECTANGULAR = dict(view=dict(name="equirectangular", fov=4.2, size=[112, 144]))
 
 
 def with_options(**options: object) -> tuple[str, ...]:
@@ -24,14 +25,14 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "DarSwin-Unet A": ("darswin_unet_a", ()),
     "DarSwin-Unet RA": ("darswin_unet_ra", ()),
     "Swin-Unet": ("swin_unet", ()),
-    "Swin-Unet (undis)": ("swin_unet_undis", ()),
-    "LensAdapter(Swin-Unet)": ("swin_unet_adapted", ()),
+    "Swin-Unet (undis)": ("swin_unet", with_options(view=UNDISTORTED)),
+    "LensAdapter(Swin-Unet)": ("swin_unet", with_options(view="square")),
     "U-Net with rays": ("conv_unet", ()),
     "U-Net, Mercator": ("conv_unet", with_options(**MERCATOR)),
     "U-Net, equirectangular": ("conv_unet", with_options(**EQUIRECTANGULAR)),
     "Swin-Unet, Mercator": ("swin_unet", with_options(**MERCATOR, window=[3, 7])),
     "Swin-Unet, equirectangular": ("swin_unet", with_options(**EQUIRECTANGULAR, window=[7, 3])),
-    "LensAdapter, lens augmentation": ("swin_unet_adapted", THROUGH_ANY),
+    "LensAdapter, lens augmentation": ("swin_unet", (*with_options(view="square"), *THROUGH_ANY)),
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
 # The models of a new study; the others are in an older record.

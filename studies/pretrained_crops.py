@@ -123,7 +123,7 @@ class Crops:
             found = boxes.spherical(thing.box[None], to_rays)
             widest = max(found.width[0], found.height[0])
             view = make_view(
-                "tangent", (SIDE, SIDE), up=tuple(self.scene.up), direction=tuple(found.ray[0]),
+                "perspective", (SIDE, SIDE), up=tuple(self.scene.up), direction=tuple(found.ray[0]),
                 fov=2 * math.atan(MARGIN * math.tan(min(widest, 2.5) / 2)),
             )  # fmt: skip
             seen = view(self.image, lens.to(torch.float32))

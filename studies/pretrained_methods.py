@@ -65,8 +65,8 @@ RAW, MERCATOR = Look("raw"), Look("mercator")
 # Methods by their name in the tables. Each look of 512² costs about one run of CenterNet.
 ONE_RUN = {
     "raw": (RAW,),
-    "rectified, 120°": (Look("tangent", options=dict(fov=math.radians(120))),),
-    "rectified, 160°": (Look("tangent", options=dict(fov=math.radians(160))),),
+    "rectified, 120°": (Look("perspective", options=dict(fov=math.radians(120))),),
+    "rectified, 160°": (Look("perspective", options=dict(fov=math.radians(160))),),
     "concentric square": (Look("square"),),
     "stereographic": (Look("stereographic"),),
     "cylindrical": (Look("cylindrical"),),

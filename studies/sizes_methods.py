@@ -34,18 +34,21 @@ class Method:
     model: str
     options: dict[str, Any] = field(default_factory=dict)
     view: str | None = None
+    view_options: dict[str, Any] = field(default_factory=dict)
     scale: float = 1.0
     rays: bool = False
     absolute: bool = False
     uses_lens: bool = True
 
 
-_CONV = "conv_unet_nano"
+_CONV, _END = "conv_unet_nano", math.radians(87.5)
 _PLAIN: dict[str, Any] = dict(options=dict(rays=False))
+# A perspective view of all that a lens sees, up to 175°.
+_UNDISTORTED: dict[str, Any] = dict(reach=_END, theta_max=_END, reads=1)
 METHODS = {
     "raw": Method(_CONV, **_PLAIN, uses_lens=False),
     "raw + rays": Method(_CONV),
-    "undistorted": Method(_CONV, **_PLAIN, view="perspective"),
+    "undistorted": Method(_CONV, **_PLAIN, view="perspective", view_options=_UNDISTORTED),
     "equirectangular": Method(_CONV, **_PLAIN, view="equirectangular"),
     "LensAdapter": Method(_CONV, **_PLAIN, view="square"),
     "LensAdapter + rays": Method(_CONV, **_PLAIN, view="square", rays=True),
@@ -72,16 +75,17 @@ class Measurer(nn.Module):
     def __init__(self, method: Method):
         super().__init__()
         self.method = method
-        edge = dict(theta_max=WIDEST) if method.absolute else {}
         # The same directions for all lenses, as in Depth Any Camera (CVPR 2025).
-        edge |= dict(fov=2 * WIDEST) if method.view == "equirectangular" else {}
+        same = method.absolute or method.view == "equirectangular"
+        grid = dict(theta_max=WIDEST) if method.absolute and method.view is None else {}
         self.network: nn.Module = create_model(
             method.model, task="distance", in_chans=6 if method.rays else 3,
-            typical_distance=TYPICAL, **method.options, **({} if method.view else edge),
+            typical_distance=TYPICAL, **method.options, **grid,
         )  # fmt: skip
         if method.view:
             side = round(method.scale * SIZE)
-            view = make_view(method.view, (side, side), **edge, mean=None, std=None)
+            options = method.view_options | (dict(fov=2 * WIDEST) if same else {})
+            view = make_view(method.view, side, **options, mean=None, std=None)
             self.network = LensAdapter(self.network, view=view)
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:

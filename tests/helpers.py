@@ -103,6 +103,12 @@ def side_of(name):
     return 64 if "unet" in name else 32
 
 
+def create(name, **options):
+    """`create_model`, also of "NAME VIEW"."""
+    name, _, view = name.partition(" ")
+    return create_model(name, **(dict(view=view) if view else {}) | options)
+
+
 def network(name, **options):
     """A nano model in eval mode with random parameters; "official" is an OfficialDarSwin."""
     options = dict(num_classes=5) | options
@@ -110,9 +116,9 @@ def network(name, **options):
         sizes = dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), samples=(4, 4))
         model = OfficialDarSwin(**(sizes | options)).eval()
     else:
-        if has_image_size(name):
+        if has_image_size(name.split()[0]):
             options = dict(image_size=side_of(name)) | options
-        model = create_model(name, **options).eval()
+        model = create(name, **options).eval()
     for key, parameter in model.named_parameters():
         mean = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
         torch.nn.init.normal_(parameter, mean=mean, std=0.1)

@@ -305,7 +305,7 @@ def test_a_wheel_for_any_system_passes_the_tests_of_models(sources, tmp_path):
     output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", site, wheel)
     assert str(site) in without_module(site)
     # Of each kind of model one, and the layers and the lenses.
-    names = "darswin_ra_nano or swin_undis_nano or dat_nano or layers or lens"
+    names = "darswin_ra_nano or swin_nano or dat_nano or layers or lens"
     tests = [ROOT / "tests" / "installed.py", "-x", "-k", names]
     done = output(sys.executable, *tests, env={"PYTHONPATH": str(site)})
     assert re.search(r"\d\d\d passed", done) and "failed" not in done

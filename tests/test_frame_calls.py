@@ -21,9 +21,10 @@ def sampler(rings, sectors, samples):
 CALLED = {
     "sampler": lambda _: sampler(4, 8, (2, 3)),
     "sampler of many points": lambda _: sampler(32, 64, (4, 4)),
+    "square": lambda folder: network_of(model_of("swin_unet", view="square"), folder),
     **{
         family: lambda folder, family=family: network_of(model_of(family), folder)
-        for family in ("darswin_a", "swin", "darswin_unet_a", "swin_unet_adapted")
+        for family in ("darswin_a", "swin", "darswin_unet_a")
     },
 }
 

@@ -39,9 +39,11 @@ CASES = [
     ("swin", dict(features_only=True, out_indices=1)),
     *((name, dict(task="distance")) for name in FAMILIES if "unet" in name),
     *((name, dict(skip_width=0, places=False, rays=False)) for name in FAMILIES if "unet" in name),
-    ("swin_unet_undis", dict(places=False)),
+    ("swin", dict(view="perspective")),
+    ("swin_unet", dict(view="square", task="distance")),
+    ("swin_unet", dict(view="perspective", places=False)),
     ("darswin_unet_ra", dict(rays=True, num_classes=3)),
-    ("swin_unet", dict(view="mercator", size=(64, 128))),
+    ("swin_unet", dict(view=dict(name="mercator", size=(64, 128)))),
     ("swin", dict(image_size=(24, 48), patch_size=3)),
     ("darswin_a", dict(periodic_bias=True, spacing="g")),
 ]

@@ -150,7 +150,7 @@ def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
 
 
 def test_a_view_cannot_be_written_over_its_own_frame():
-    plan = camera.plan(make_view("tangent", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
+    plan = camera.plan(make_view("perspective", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
     sampler, frame = frames.Sampler(plan), random_frame(50, 60, 3)
     with pytest.raises(ValueError, match="out must not share memory with the frame"):
         sampler(frame, out=frame)

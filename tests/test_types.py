@@ -39,13 +39,14 @@ from darswin.models import (
     DAT, ConvUnet, DarSwin, Encoder, FeatureMaps, LensAdapter, ModelCard, Swin, Unet,
 )
 from darswin.models.pixel import PixelModel
+from darswin.views import make_view
 
 assert_type(create_model("darswin_a_nano"), DarSwin)
 assert_type(create_model("darswin_ra_small", num_classes=3, spacing="tan"), DarSwin)
-assert_type(create_model("swin_undis_tiny", features_only=False), Swin)
+assert_type(create_model("swin_tiny", view="mercator", features_only=False), Swin)
 assert_type(create_model("dat_nano"), DAT)
 assert_type(create_model("darswin_unet_a_micro", task="distance"), Unet)
-assert_type(create_model("swin_unet_adapted_nano"), Unet)
+assert_type(create_model("swin_unet_nano", view=make_view("square", 128)), Unet)
 assert_type(create_model("conv_unet_nano"), ConvUnet)
 assert_type(create_model("darswin_a_nano", features_only=True), FeatureMaps)
 assert_type(create_model("swin_nano", features_only=True, out_indices=(0, 1)), FeatureMaps)

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.calibrate.calibration import Calibration
+from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.inputs import LEAST_CORNERS, CalibrationError
 from darswin.calibrate.refine import MEDIAN, OFF, SHARPEST
 
@@ -20,7 +20,7 @@ SHOWN = 10  # corners
 
 
 def doubts(
-    found: Calibration, seen: Tensor, middle: Tensor, stretch: tuple[float, float]
+    found: CalibratedLens, seen: Tensor, middle: Tensor, stretch: tuple[float, float]
 ) -> list[str]:
     """What looks wrong, in sentences; seen: (P, K); middle: (3,), of the board's points; stretch:
     how much longer than in x things seem in y, as a part of their length: in the picture, and on

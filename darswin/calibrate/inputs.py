@@ -48,12 +48,12 @@ def checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Ten
     return Views(torch.where(seen[..., None], found, 0.0), seen, board), points
 
 
-def _spans(places: Tensor, seen: Tensor, least: float) -> Tensor:
-    """(...) bool: enough of the places (..., K, 2) are seen, (..., K), and they are not on one
+def _spans(points: Tensor, seen: Tensor, least: float) -> Tensor:
+    """(...) bool: enough of the points (..., K, 2) are seen, (..., K), and they are not on one
     line: their mean square distance from a line is at least `least`."""
     count = seen.sum(-1).clamp(min=1)[..., None, None]
-    places = torch.where(seen[..., None], places, 0.0)
-    apart = torch.where(seen[..., None], places - places.sum(-2, keepdim=True) / count, 0.0)
+    points = torch.where(seen[..., None], points, 0.0)
+    apart = torch.where(seen[..., None], points - points.sum(-2, keepdim=True) / count, 0.0)
     thin = torch.linalg.eigvalsh(apart.mT @ apart / count)[..., 0] < least
     return (seen.sum(-1) >= LEAST_CORNERS) & ~thin
 

@@ -135,11 +135,11 @@ class Views(NamedTuple):
         vector of each pose in the camera's frame, and by its translation; 0 where not seen."""
         points, count = self.points(state), len(state.vector)
 
-        def places(numbers: Tensor) -> Tensor:
+        def pixels(numbers: Tensor) -> Tensor:
             lens = free.at(numbers[:, :count], state.lens.theta_max)
             return pixels_of(lens, points + numbers[:, None, None, count:])
 
-        slopes = slopes_of(places, torch.cat((state.vector, state.vector.new_zeros(3))))
+        slopes = slopes_of(pixels, torch.cat((state.vector, state.vector.new_zeros(3))))
         there = self.seen & slopes.isfinite().flatten(2).all(-1)
         slopes = torch.where(there[..., None, None], slopes, 0.0)
         by_point = slopes[..., count:]

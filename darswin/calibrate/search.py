@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.calibrate import radial
-from darswin.calibrate.calibration import Calibration
+from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts
 from darswin.calibrate.inputs import (
     LEAST_PICTURES,
@@ -56,7 +56,7 @@ def calibrate(
     square_pixels: bool = True,
     accept: Callable[[Lens], bool] | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Calibration:
+) -> CalibratedLens:
     """Finds the lens of a camera from the corners of a board in its pictures.
 
     It needs no guess, for fields of view up to 250°. Corners and pictures that do not fit the
@@ -127,7 +127,7 @@ def calibrate(
     lens, seen = best.state.lens, views.seen
     supported = theta[best.fits(best.sigma)].quantile(0.99).item()
     lens = lens.with_theta_max(reach(lens))
-    calibration = Calibration(
+    result = CalibratedLens(
         lens=lens,
         rotations=all_pictures(best.state.rotations),
         translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
@@ -150,8 +150,8 @@ def calibrate(
     )
     picture, board = best.stretch(views, counts)
     stretch = picture if square_pixels else 0.0, board  # else the lens has the ratio of its pixels
-    calibration.doubts.extend(doubts(calibration, whole.seen, spot, stretch))
-    return calibration
+    result.doubts.extend(doubts(result, whole.seen, spot, stretch))
+    return result
 
 
 def _kind(model: Any) -> type[Lens]:

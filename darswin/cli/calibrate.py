@@ -22,8 +22,7 @@ from darswin.utils.parameters import check, with_flags
 if TYPE_CHECKING:
     import numpy as np
 
-    from darswin.calibrate import Board
-    from darswin.calibrate import Calibration as Found
+    from darswin.calibrate import Board, CalibratedLens
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 Kind = Literal["chessboard", "charuco", "april"]
@@ -266,7 +265,7 @@ def _label(doubt: str, seen: _Seen) -> str:
     return "note" if is_usual else "looks wrong"
 
 
-def _summary(found: "Found", seen: _Seen, lens: Lens) -> str:
+def _summary(found: "CalibratedLens", seen: _Seen, lens: Lens) -> str:
     corners = int((found.weights > 0.1).sum())
     rows = [
         ("pictures", f"{int(found.used.sum())} of {seen.total}"),

@@ -8,7 +8,7 @@ from darswin.cli.arguments import check_out
 from darswin.cli.calibrate import Format, calibrate, check_lens_out, write_lens
 from darswin.cli.estimate import estimate
 from darswin.cli.undistort import undistort
-from darswin.cli.views import Look, Up, View
+from darswin.cli.views import Look, Up
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
@@ -30,7 +30,7 @@ _SIDES = "from 1 to 1000000 px"
 def show(
     calib: str, image: str, *, out: str = "lens.png", rings: int = 16, sectors: int = 64,
     samples: tuple[int, int] = (10, 10), spacing: Spacing = "theta",
-    view: View = "perspective", fov_deg: float | None = None, yaw_deg: float = 0.0,
+    view: str = "perspective", fov_deg: float | None = None, yaw_deg: float = 0.0,
     pitch_deg: float = 0.0, up: Up | None = None, theta_max_deg: float | None = None,
     camera: str | None = None, coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
@@ -44,9 +44,10 @@ def show(
         sectors: the number of sectors of the partition.
         samples: the numbers of samples in each patch along radius and azimuth, e.g. 10,10.
         spacing: the quantity that the rings divide into equal parts.
-        view: the projection of the undistorted view.
-        fov_deg: the horizontal field of view of the undistorted view, in degrees. The default is
-            all that the picture shows; for a perspective view, 110° at most; for a panorama, 360°.
+        view: the projection of the undistorted view: see `darswin lens undistort`.
+        fov_deg: the horizontal field of view of the undistorted view, between the outer edges of a
+            row, in degrees. The default is all that the picture shows; for a perspective view, 100°
+            at most; for a panorama, 360°.
         yaw_deg: the angle that the undistorted view looks to the right, in degrees.
         pitch_deg: the angle that the undistorted view looks up, in degrees.
         up: the direction away from gravity, for the undistorted view: see `darswin lens undistort`.

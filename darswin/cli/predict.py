@@ -97,8 +97,8 @@ def predict(
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
         size: height and width of the view in px, such as 512,512, if the network takes any size.
-        fov_deg: the horizontal field of view of the view, in degrees. The default is all that the
-            lens sees.
+        fov_deg: the horizontal field of view of the view between the outer edges of a row, in
+            degrees. The default is all that the lens sees.
         up: the direction away from gravity, as x right, y down and z forward of the camera. The
             default is the top of the picture, 0,-1,0.
         mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import darswin.lens
-from darswin.cli.views import Look, Up, View, to_corners
+from darswin.cli.views import Look, Up, to_corners
 from darswin.lens import Lens, Perspective
 from darswin.lens.files.load import reach
 from darswin.lens.files.opencv import Coefficients
@@ -29,7 +29,7 @@ _KEPT = 8  # plans in memory, for pictures of several sizes or cameras
 
 
 def undistort(
-    calib: str, paths: Sequence[str] = (), *, out: str, view: View = "perspective",
+    calib: str, paths: Sequence[str] = (), *, out: str, view: str = "perspective",
     fov_deg: float | None = None, size: tuple[int, int] | None = None, yaw_deg: float = 0.0,
     pitch_deg: float = 0.0, up: Up | None = None, theta_max_deg: float | None = None,
     camera: str | None = None, coefficients: Coefficients | None = None,
@@ -48,14 +48,16 @@ def undistort(
         out: the folder to write to: new, empty, or from an earlier undistort, whose files are
             replaced. Pictures have 8 bits per channel and no transparency, videos have no sound.
             Endings that cannot be written get .png or .mp4 in addition.
-        view: the projection. A perspective view shows straight lines straight, but its sides become
-            coarse above 110°. A cylindrical view shows verticals straight. Equirectangular and
-            Mercator views are parts of a map of the sphere; in a Mercator view and in a
+        view: the projection: perspective, cylindrical, equirectangular, mercator, stereographic,
+            panorama or square. A perspective view shows straight lines straight, but its middle
+            becomes coarse above 100°. A cylindrical view shows verticals straight. Equirectangular
+            and Mercator views are parts of a map of the sphere; in a Mercator view and in a
             stereographic one things keep their shape. A panorama shows all directions around the
             vertical, for cameras that look down or up. A square shows the whole image disc, in
             equal steps of the incident angle.
-        fov_deg: the horizontal field of view, in degrees. The default is all that the picture
-            shows; for a perspective view, 110° at most; for a panorama, 360°.
+        fov_deg: the horizontal field of view between the outer edges of a row, in degrees. The
+            default is all that the picture shows; for a perspective view, 100° at most; for a
+            panorama, 360°.
         size: height and width of the views in px, e.g. 480,640. The default is a shape that fits
             the view, with the longer side of the picture; a square has the shorter one. Videos have
             even sides.

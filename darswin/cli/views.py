@@ -1,43 +1,18 @@
 """The undistorted views of `darswin lens`: their options, and what they show by default."""
 
+import inspect
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
-
-import torch
+from typing import Any, NamedTuple
 
 from darswin.lens import BrownConrady, Lens, Perspective
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check, naming
-from darswin.views import (
-    CylindricalView,
-    EquirectangularView,
-    MercatorView,
-    PanoramaView,
-    PixelView,
-    RayView,
-    SquareView,
-    StereographicView,
-    TangentView,
-    make_view,
-    turned,
-)
-from darswin.viz.report import sides
+from darswin.views import PixelView, make_view, turned
+from darswin.views.registry import flat_views, view_class
 
-View = Literal[
-    "perspective", "cylindrical", "equirectangular", "mercator", "stereographic", "panorama",
-    "square",
-]  # fmt: skip
 Up = tuple[float, float, float]
-_RAY_VIEWS: dict[str, type[RayView]] = {
-    "perspective": TangentView,
-    "tangent": TangentView,
-    "cylindrical": CylindricalView,
-    "equirectangular": EquirectangularView,
-    "mercator": MercatorView,
-    "stereographic": StereographicView,
-}
 
 
 class NarrowView(UserWarning):
@@ -45,9 +20,9 @@ class NarrowView(UserWarning):
 
 
 class Look(NamedTuple):
-    """The options of an undistorted view."""
+    """The options of an undistorted view; its name is one of `flat_views()`."""
 
-    view: View
+    view: str
     fov_deg: float | None
     yaw_deg: float
     pitch_deg: float
@@ -55,57 +30,51 @@ class Look(NamedTuple):
 
     def check(self) -> None:
         """ValueError for an option that is out of its range."""
+        check("view", self.view, self.view in flat_views(), f"one of {', '.join(flat_views())}")
         for name, angle in (("yaw_deg", self.yaw_deg), ("pitch_deg", self.pitch_deg)):
             check(name, angle, -360 <= angle <= 360, "from -360° to 360°")
-            ahead = "0 for a square view, which looks along the optical axis"
-            check(name, angle, self.view != "square" or angle == 0, ahead)
+            ahead = f"0 for a {self.view} view, which looks along the optical axis"
+            check(name, angle, self._turns or angle == 0, ahead)
         _check_fov_and_up(self.view, self.fov_deg, self.up)
-        check("up", self.up, self.view != "square" or self.up is None, "left out for a square view")
-        whole = self.view != "panorama" or self.fov_deg in (None, 360)
-        check("fov_deg", self.fov_deg, whole, "360° for a panorama view")
+        left_out = f"left out for a {self.view} view"
+        check("up", self.up, self._turns or self.up is None, left_out)
+        whole = not self._around or self.fov_deg in (None, 360)
+        check("fov_deg", self.fov_deg, whole, f"360° for a {self.view} view")
+
+    @property
+    def _turns(self) -> bool:
+        return "direction" in inspect.signature(view_class(self.view)).parameters
+
+    @property
+    def _around(self) -> bool:
+        return getattr(view_class(self.view), "around", False)
 
     def shape(self, lens: Lens, size: tuple[int, int], side: int) -> tuple[float, tuple[int, int]]:
         """The field of view, in degrees, and (H, W) of a view whose longer side has `side` px.
 
-        By default the view shows all that pictures of (H, W) show in the row of the principal
-        point; a perspective view 110° at most, a panorama 360°, and a square all up to θ_max.
+        By default the view shows what its class says of pictures of (H, W).
         """
-        across, down = _fields_of_view(lens, size)
-        fov_deg = self.fov_deg
-        if fov_deg is None:
-            fov_deg = {
-                "perspective": min(across, 110.0),
-                "stereographic": min(across, 340.0),
-                "panorama": 360.0,
-                "square": 2 * math.degrees(lens.theta_max.item()),
-            }.get(self.view, across)
-            if not fov_deg > 0:
-                raise ValueError(
-                    "the picture shows nothing in the row of the lens's principal point: choose "
-                    "the view with --fov_deg and --yaw_deg"
-                )
-        aspect = {
-            "cylindrical": 1 / 2,
-            # The height of all that the picture shows; narrower views keep this shape.
-            "equirectangular": down / max(fov_deg, across),
-            "panorama": 1 / 3,
-            "square": 1.0,
-        }.get(self.view, size[0] / size[1])
+        given = None if self.fov_deg is None else math.radians(self.fov_deg)
+        fov, aspect = view_class(self.view).usual_shape(lens, size, given)
+        if not fov > 0:
+            raise ValueError(
+                "the picture shows nothing in the row of the lens's principal point: choose the "
+                "view with --fov_deg and --yaw_deg"
+            )
         longer = max(aspect, 1.0)
-        return fov_deg, (max(1, round(side * aspect / longer)), max(1, round(side / longer)))
+        shape = max(1, round(side * aspect / longer)), max(1, round(side / longer))
+        return math.degrees(fov) if self.fov_deg is None else self.fov_deg, shape
 
     def make(self, size: tuple[int, int], fov_deg: float) -> PixelView:
         """The view of (H, W)."""
-        fov = math.radians(fov_deg)
-        if self.view == "square":
-            # Its edge is before π, where all directions are one.
-            return SquareView(size, theta_max=min(fov / 2, math.nextafter(math.pi, 0)))
-        turn = turned(math.radians(self.yaw_deg), math.radians(self.pitch_deg))
-        if self.up is not None:
-            turn["up"] = self.up
-        if self.view == "panorama":
-            return PanoramaView(size, **turn)
-        return _RAY_VIEWS[self.view](size, fov, **turn)
+        turn: dict[str, Any] = {}
+        if self._turns:
+            turn = turned(math.radians(self.yaw_deg), math.radians(self.pitch_deg))
+            turn |= {} if self.up is None else dict(up=self.up)
+        fov = None if self._around else math.radians(fov_deg)
+        view = make_view(self.view, size, fov=fov, **turn)
+        assert isinstance(view, PixelView)
+        return view
 
 
 def _check_fov_and_up(view: str, fov_deg: float | None, up: Sequence[float] | None) -> None:
@@ -115,7 +84,7 @@ def _check_fov_and_up(view: str, fov_deg: float | None, up: Sequence[float] | No
         check("up", up, vector, "three finite numbers that are not all 0")
     if fov_deg is None:
         return
-    widest = _RAY_VIEWS.get(view, RayView).widest
+    widest = getattr(view_class(view), "widest", 2 * math.pi)
     most = f"above 0° and at most {math.degrees(widest):.4g}° for a {view} view"
     check("fov_deg", fov_deg, 0 < math.radians(fov_deg) <= widest, most)
     if fov_deg <= 2 * math.pi:
@@ -153,7 +122,7 @@ def named_view(
         check(parameter, spec, count.isdecimal(), "NAME or NAME:COUNT, such as tiles:5")
         options["count"] = int(count)
     if fov_deg is not None:
-        options["max_fov" if name == "perspective" else "fov"] = math.radians(fov_deg)
+        options["fov"] = math.radians(fov_deg)
     try:
         view = make_view(name, size, **options)
     except TypeError as error:
@@ -161,10 +130,3 @@ def named_view(
     if not isinstance(view, PixelView):
         raise naming(ValueError(f"`{parameter}` {name} shows no picture to a network"), parameter)
     return view
-
-
-def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
-    """Horizontal and vertical field of view up to θ_max in a picture (H, W), in degrees."""
-    end = lens.theta_max.item()
-    angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
-    return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()

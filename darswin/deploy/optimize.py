@@ -36,7 +36,7 @@ def optimize(
     dtype: torch.dtype | Literal["fastest"] = torch.float32,
     *,
     lens: Lens | None = None,
-    calibration: Iterable[Sequence] | None = None,
+    batches: Iterable[Sequence] | None = None,
 ) -> Net:
     """A copy of a model that computes the same results faster, for inference on CPUs.
 
@@ -49,32 +49,32 @@ def optimize(
             layers and the result are bfloat16; distances stay float32. With int8, the products of a
             quantized model (see `quantize_model`) are computed with 8 bits, and the rest with
             float32; for a picture with infinite or NaN pixels the result is finite but meaningless.
-            "fastest": int8 for a quantized model or with a calibration, otherwise float32 or
+            "fastest": int8 for a quantized model or with `batches`, otherwise float32 or
             bfloat16, whichever is faster here.
         lens: a single lens, if all images come from one camera. The copy is then called
             `optimized(images)`. It computes the grid and the position biases once for each image
             size.
-        calibration: batches (images, lens) of typical pictures. With int8, they quantize a model
-            that is not quantized yet.
+        batches: of (images, lens), typical pictures. With int8, they quantize a model that is not
+            quantized yet.
 
     Warns if torch lacks oneDNN's bfloat16 products. The copy then uses torch's own, which are
     slower.
 
     Raises:
         TypeError: another kind of model.
-        ValueError: an unsupported dtype or device; a `lens` that is not a single lens; a
-            calibration without int8 or for a quantized model; int8 with neither.
+        ValueError: an unsupported dtype or device; a `lens` that is not a single lens; batches
+            without int8 or for a quantized model; int8 with neither.
         ImportError: darswin's compiled module cannot be loaded.
     """
     check_model(model, dtype, lens)
     _module.require("optimize")
     if dtype == "fastest":
-        is_whole = calibration is None and not quantized_layers(model)
+        is_whole = batches is None and not quantized_layers(model)
         dtype = fastest_dtype() if is_whole else torch.int8
     if dtype == torch.int8:
-        model, dtype = _quantized(model, calibration), torch.float32
-    elif calibration is not None or quantized_layers(model):
-        raise ValueError(f"a quantized model or a calibration needs dtype=torch.int8, got {dtype}")
+        model, dtype = _quantized(model, batches), torch.float32
+    elif batches is not None or quantized_layers(model):
+        raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
         warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False).float()
@@ -89,13 +89,13 @@ def optimize(
     return optimized
 
 
-def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
-    if bool(quantized_layers(model)) == (calibration is not None):
+def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:
+    if bool(quantized_layers(model)) == (batches is not None):
         raise ValueError(
-            "int8 needs either a quantized model (see quantize_model) or a calibration: batches "
-            "(images, lens) of typical pictures"
+            "int8 needs either a quantized model (see quantize_model) or batches of "
+            "(images, lens), typical pictures"
         )
-    return model if calibration is None else quantize_model(model, calibration)
+    return model if batches is None else quantize_model(model, batches)
 
 
 def check_model(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:

@@ -290,7 +290,7 @@ def fastest_dtype() -> torch.dtype:
     """The faster of float32 and bfloat16 on this CPU.
 
     It times a typical product once per process, for a tenth of a second. bfloat16 is much faster on
-    CPUs with instructions for it, and slower on others. int8 needs a calibration, so it is not a
+    CPUs with instructions for it, and slower on others. int8 needs typical pictures, so it is not a
     candidate.
     """
     dtypes = [d for d in (torch.float32, torch.bfloat16) if onednn_lack(d) is None]

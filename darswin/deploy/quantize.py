@@ -43,7 +43,7 @@ _SHARES = torch.linspace(0.1, 1.0, 46).tolist()
 
 def quantize_model(
     model: Net,
-    calibration: Iterable[Sequence],
+    batches: Iterable[Sequence],
     *,
     keep: Collection[str] = (),
     tolerance: float = 0.01,
@@ -54,13 +54,13 @@ def quantize_model(
     any machine. `darswin.optimize` turns the simulated products into integer products. The copy has
     no gradients.
 
-    The range of each activation minimises the mean squared error over the calibration. If the
+    The range of each activation minimises the mean squared error over the batches. If the
     copy's error is above `tolerance`, the parts of the model with the largest errors go back to
     float32, one after the other. `sensitivities` lists the parts and their errors.
 
     Args:
         model: a model of `create_model`, in float32 on the CPU.
-        calibration: batches (images, lens, ...) or a data loader. Use a few hundred typical
+        batches: of (images, lens, ...), such as a data loader. Use a few hundred typical
             pictures with their lenses.
         keep: names of modules that stay in float32, together with their submodules.
         tolerance: largest error: the mean squared change of the result, divided by the variance of
@@ -71,7 +71,7 @@ def quantize_model(
         ValueError: no pictures; an unknown name; a model that is not float32, not on the CPU or
             already quantized; or no part of the model stays within the tolerance.
     """
-    found = _Calibration(model, calibration, keep)
+    found = _Ranges(model, batches, keep)
     chosen = list(found.parts)
     result = found.quantized(chosen)
     error = found.error(result)
@@ -88,28 +88,28 @@ def quantize_model(
     return result
 
 
-def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, float]:
+def sensitivities(model: Model, batches: Iterable[Sequence]) -> dict[str, float]:
     """Error of the model's result for each part, if only that part computes with 8 bits.
 
     The parts are "attn.qkv", "attn.proj" and "mlp" of each block, and "reduction" of each merging
     layer.
 
     Args:
-        model, calibration: see `quantize_model`.
+        model, batches: see `quantize_model`.
 
     Returns:
         the error of each part by name, the largest first. The error is the mean squared change of
         the result, divided by the variance of the result.
     """
-    errors = _Calibration(model, calibration, ()).alone()
+    errors = _Ranges(model, batches, ()).alone()
     return dict(sorted(errors.items(), key=lambda item: -item[1]))
 
 
-class _Calibration(Generic[Net]):
-    """A model, its calibration pictures, and the ranges of its activations."""
+class _Ranges(Generic[Net]):
+    """A model, typical pictures, and the ranges of its activations."""
 
-    def __init__(self, model: Net, calibration: Iterable[Sequence], keep: Collection[str]):
-        self.batches = _batches(model, calibration)
+    def __init__(self, model: Net, batches: Iterable[Sequence], keep: Collection[str]):
+        self.batches = _checked(model, batches)
         self.model, self.parts = model, _parts(model, keep)
         if not self.parts:
             raise ValueError("the model has no part that could be quantized: no block, or all kept")
@@ -162,7 +162,7 @@ class Change:
         return math.inf if changed else 0.0
 
 
-def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
+def _checked(model: nn.Module, batches: Iterable[Sequence]) -> Batches:
     if not isinstance(model, Model):
         raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
     if quantized_layers(model):
@@ -170,17 +170,16 @@ def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
     kinds = {(p.dtype, p.device.type) for p in model.parameters()}
     if kinds != {(torch.float32, "cpu")}:
         raise ValueError(f"model must be in float32 on the CPU, got {kinds}")
-    batches = []
-    for batch in calibration:
+    found = []
+    for batch in batches:
         if isinstance(batch, Tensor) or len(batch) < 2 or not isinstance(batch[1], Lens | None):
             raise TypeError(
-                "calibration must give batches (images, lens), got a batch of type "
-                f"{type(batch).__name__}"
+                f"batches must be of (images, lens), got a batch of type {type(batch).__name__}"
             )
-        batches.append((batch[0], batch[1]))
-    if not sum(len(images) for images, _ in batches):
-        raise ValueError("calibration has no pictures")
-    return batches
+        found.append((batch[0], batch[1]))
+    if not sum(len(images) for images, _ in found):
+        raise ValueError("batches must have pictures, got none")
+    return found
 
 
 def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
@@ -258,7 +257,7 @@ def _observed(
 def _best_range(name: str, values: Tensor, ends: Tensor) -> Quantization:
     """The quantization with the least mean squared error."""
     if not ends.isfinite().all():
-        raise ValueError(f"the input of {name} is not finite: check the calibration pictures")
+        raise ValueError(f"the input of {name} is not finite: check the pictures")
     lower, upper = min(ends.min().item(), 0.0), max(ends.max().item(), 0.0)
 
     def error(ends: tuple[float, float]) -> float:

@@ -167,7 +167,7 @@ def _least_squares(
         limits = {"theta_max": theta_max.expand(len(vectors))}
         return model._from_tensors(packing.tensors(vectors) | limits)
 
-    def places(vectors: Tensor) -> Tensor:
+    def points(vectors: Tensor) -> Tensor:
         return lenses_of(vectors)._flat(theta, direction)
 
     def cost_of(vector: Tensor) -> float:
@@ -182,8 +182,8 @@ def _least_squares(
         return lenses_of(vector[None]), math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
     for _ in range(rounds):
-        error = (places(vector[None]) - goal).flatten()
-        slopes = slopes_of(places, vector).flatten(0, -2)
+        error = (points(vector[None]) - goal).flatten()
+        slopes = slopes_of(points, vector).flatten(0, -2)
         scale = slopes.norm(dim=0).clamp(min=1e-30)
         before = cost
         while damping < 1e12:

@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.lens.ideal import Perspective
 from darswin.lens.solve import determinant, length_of, vector_of
 from darswin.ops.checks import tensor_there
 
@@ -169,11 +168,3 @@ def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     points = points.expand(images.shape[0], -1, -1, -1)
     view = F.grid_sample(images.to(exact), points, mode, padding_mode="zeros", align_corners=False)
     return view.to(images.dtype)
-
-
-def perspective_view(lens: Lens, size: tuple[int, int], max_fov: float) -> Perspective:
-    """The perspective lens with a lens's field of view, at most `max_fov` (rad, below π). θ_max
-    lands at half the shorter side of (H, W)."""
-    theta_max = lens.theta_max.clamp(max=max_fov / 2)
-    focal = min(size) / 2 / torch.tan(theta_max)
-    return Perspective._from_tensors(dict(focal=focal, theta_max=theta_max, center=None))

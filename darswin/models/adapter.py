@@ -8,13 +8,10 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from darswin.lens import Lens
-from darswin.lens.spacing import Spacing
-from darswin.models.base import Model, Prepared
+from darswin.models.base import Model, Prepared, check_given_once
 from darswin.models.detections import detections_to_images, find_detections
-from darswin.ops.checks import as_int
 from darswin.views import PixelView, View, make_view
-from darswin.views.base import Pair, PerChannel
-from darswin.views.directions import Vector
+from darswin.views.base import Pair, PerChannel, size_of
 from darswin.views.remap import Remaps
 
 
@@ -35,18 +32,17 @@ class LensAdapter(Model[Any]):
       for each image. Lists, tuples and dicts of results may be nested.
 
     The network may come from timm, from segmentation_models_pytorch or from you, trained or not.
-    Pretrained weights want a view in which things stand upright and keep their shape: "mercator"
-    for one run per image, "tiles" for several. A network that is trained from scratch may take the
-    square, the default: the image disc by the concentric map, in which equal steps of θ are at
+    Pretrained weights want a view in which things stand upright and keep their shape: "mercator",
+    the default, for one run per image, "tiles" for several. A network that is trained from scratch
+    may take the "square": the image disc by the concentric map, in which equal steps of θ are at
     equal distances from the centre, whatever the lens is. The adapter is called `adapter(images,
     lens)`. It gives images in floating point to the network as they are.
 
     Args:
         network: a module that takes images (B, C, H', W').
-        size: (H', W') of the view in pixels, or the side of a square. A `View` has its own size.
-        spacing, theta_max, max_fov, fov, up, direction, count: options of the view; None means the
-            view's own default, and views refuse the options of others.
-        view: the name of a view, one of `list_views()`; or a `View`, with its own options.
+        size: (H', W') of a view by name in pixels, or the side of a square.
+        view: a `View`, which has its own size, mean and std: `make_view` takes its options. Or the
+            name of a view, one of `list_views()`, with its own defaults.
         mean, std: the normalization of uint8 images that the network expects, `(pixel/255 - mean) /
             std`, one number or one for each channel. None refuses uint8 images.
         output: "pixels" resamples results with 4 dimensions as described; "view" returns all
@@ -54,10 +50,11 @@ class LensAdapter(Model[Any]):
         boxes: a function that makes detections of the network's results, if they have another form.
 
     Raises:
-        ValueError: the size is below 1, an option of the view is wrong, the output is unknown, or
-            mean and std do not fit together; in forward, the number of detections does not fit.
-        TypeError: in forward, images of uint8 without mean and std, or results of `boxes` that are
-            no detections.
+        ValueError: the size is below 1, an argument is given beside a `View`, the output is
+            unknown, or mean and std do not fit together; in forward, the number of detections does
+            not fit.
+        TypeError: the size is no int and no pair of ints; in forward, images of uint8 without mean
+            and std, or results of `boxes` that are no detections.
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
     """
@@ -69,15 +66,8 @@ class LensAdapter(Model[Any]):
         self,
         network: nn.Module,
         size: int | Pair | None = None,
-        spacing: Spacing | None = None,
-        theta_max: float | None = None,
         *,
-        view: str | View = "square",
-        max_fov: float | None = None,
-        fov: float | None = None,
-        up: Vector | None = None,
-        direction: Vector | None = None,
-        count: int | None = None,
+        view: str | View = "mercator",
         mean: PerChannel | None = None,
         std: PerChannel | None = None,
         output: Literal["pixels", "view"] = "pixels",
@@ -86,19 +76,12 @@ class LensAdapter(Model[Any]):
         super().__init__()
         if output not in ("pixels", "view"):
             raise ValueError(f"output must be 'pixels' or 'view', got {output!r}")
-        options = dict(
-            spacing=spacing, theta_max=theta_max, max_fov=max_fov, fov=fov, up=up,
-            direction=direction, count=count,
-        )  # fmt: skip
         if isinstance(view, View):
-            given = dict(options, size=size, mean=mean, std=std)
-            if wrong := [name for name, value in given.items() if value is not None]:
-                raise ValueError(f"a View has its own {' and '.join(wrong)}: leave them out")
-            if not view.in_pixels:
-                raise ValueError(f"the network needs a view of pixels, got {view}")
-            self.view = view
+            check_given_once(size=size, mean=mean, std=std)
         else:
-            self.view = make_view(view, _pair(size), mean=mean, std=std, **options)
+            view = make_view(view, size, mean=mean, std=std)
+        size_of(view)  # or an error, if it is not of pixels
+        self.view = view
         self.network, self.output, self.boxes = network, output, boxes
         self.goes_back = output == "pixels"
         if self.mean is None:
@@ -148,10 +131,3 @@ class LensAdapter(Model[Any]):
 
     def extra_repr(self) -> str:
         return f"output={self.output!r}"
-
-
-def _pair(size: int | Pair | None) -> Pair:
-    sides = [as_int(side) or 0 for side in (size if isinstance(size, tuple) else (size, size))]
-    if len(sides) != 2 or min(sides) < 1:
-        raise ValueError(f"size must be an int of at least 1, or (H', W'), got {size!r}")
-    return sides[0], sides[1]

@@ -13,9 +13,16 @@ from darswin.layers.transformer import Block, Stage
 from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
 from darswin.ops._library import transformed
-from darswin.ops.checks import readable
-from darswin.views import View
-from darswin.views.base import Pair, PerChannel, PreparedPixels, PreparedPolar, check_images
+from darswin.ops.checks import per_channel, readable
+from darswin.views import View, make_view
+from darswin.views.base import (
+    Pair,
+    PerChannel,
+    PreparedPixels,
+    PreparedPolar,
+    check_images,
+    check_one_picture,
+)
 
 Result = TypeVar("Result", covariant=True)
 
@@ -343,6 +350,39 @@ class Model(nn.Module, Generic[Result]):
         for module in self.modules():
             if isinstance(module, Block):
                 module.grad_checkpointing = enable
+
+
+def view_of_model(
+    view: str | View, size: int | Pair | None, channels: int, mean: PerChannel | None,
+    std: PerChannel | None,
+) -> View:  # fmt: skip
+    """The view of one picture that a model sees of images with C channels.
+
+    Args:
+        view: a `View`, which has its own size, mean and std; or the name of one.
+        size: of a view by name.
+        mean, std: of a view by name; None means 0 and 1.
+
+    Raises:
+        ValueError: mean or std are given twice or do not fit, or the view is not of one picture.
+    """
+    if isinstance(view, View):
+        check_given_once(mean=mean, std=std)
+        mean, std = view.mean, view.std
+    else:
+        mean, std = 0.0 if mean is None else mean, 1.0 if std is None else std
+    if mean is not None and std is not None:
+        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
+    if not isinstance(view, View):
+        view = make_view(view, size, mean=mean, std=std)
+    check_one_picture(view)
+    return view
+
+
+def check_given_once(**given: Any) -> None:
+    """ValueError for arguments that are given beside a `View`, which has its own."""
+    if wrong := [name for name, value in given.items() if value is not None]:
+        raise ValueError(f"a View has its own {' and '.join(wrong)}: leave them out")
 
 
 def _largest(images: Tensor) -> float:

@@ -7,16 +7,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.lens.spacing import Spacing
-from darswin.models.base import Prepared
+from darswin.models.base import Prepared, check_given_once, view_of_model
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
 from darswin.models.registry import Presets, register_model
-from darswin.ops.checks import per_channel, side_or_pair
 from darswin.utils.tasks import PixelTask
-from darswin.views import make_view
-from darswin.views.base import Pair, PerChannel, check_count, check_one_picture
-from darswin.views.directions import Vector
+from darswin.views import View
+from darswin.views.base import Pair, PerChannel, check_count
 
 # About as many parameters as "darswin_unet_a" of the same size.
 _SIZES: Presets = dict(
@@ -57,13 +54,12 @@ class ConvUnet(PixelModel):
         rays: False leaves the viewing directions out; with the view "none", the model then ignores
             its lens.
         typical_distance: the distance, in m, around which "distance" starts.
-        view: the name of a view of pixels, one of `list_views()`. "none" takes the images as they
-            are.
-        size: (H', W') of the view in pixels, or the side of a square; "none" ignores it.
-        max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
-            own default, and views refuse the options of others.
-        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
-            point are not normalized.
+        view: what the network sees of the images through their lenses: a `View`, or the name of
+            one, `list_views()`, of `size` and with its own defaults. "none" takes the images as
+            they are.
+        size: (H', W') of a view by name, or the side of a square; "none" ignores it.
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`, by default with 0 and
+            1, unless a `View` has them; images in floating point are not normalized.
 
     Raises:
         ValueError: a width or another option is wrong, or the view is of several pictures.
@@ -83,28 +79,18 @@ class ConvUnet(PixelModel):
         widths: Sequence[int] = (15, 30, 60, 120),
         rays: bool = True,
         typical_distance: float = 10.0,
-        view: str = "none",
-        size: int | Pair = 128,
-        max_fov: float | None = None,
-        spacing: Spacing | None = None,
-        theta_max: float | None = None,
-        fov: float | None = None,
-        up: Vector | None = None,
-        direction: Vector | None = None,
-        mean: PerChannel = 0.0,
-        std: PerChannel = 1.0,
+        view: str | View = "none",
+        size: int | Pair | None = None,
+        mean: PerChannel | None = None,
+        std: PerChannel | None = None,
     ):
         super().__init__(task, typical_distance)
         if min(widths, default=0) < 1:
             raise ValueError(f"widths must be at least 1, for at least one level, got {widths}")
         self.in_chans, self.reads_rays = in_chans, rays
-        mean, std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
-        self.view = make_view(
-            view, None if view == "none" else side_or_pair("size", size), mean=mean, std=std,
-            max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov, up=up,
-            direction=direction,
-        )  # fmt: skip
-        check_one_picture(self.view)
+        if isinstance(view, View):
+            check_given_once(size=size)
+        self.view = view_of_model(view, None if view == "none" else size, in_chans, mean, std)
         self.goes_back = self.view.uses_lens
         self.feature_info = FeatureInfo(
             dict(num_chs=width, reduction=2**level, module=f"down.{level}", map_size=None)

@@ -19,17 +19,12 @@ DarSwinName = Literal[
     "darswin_ra_small", "darswin_ra_tiny", "darswin_ra_micro", "darswin_ra_nano",
 ]  # fmt: skip
 DATName = Literal["dat_small", "dat_tiny", "dat_micro", "dat_nano"]
-SwinName = Literal[
-    "swin_small", "swin_tiny", "swin_micro", "swin_nano",
-    "swin_undis_small", "swin_undis_tiny", "swin_undis_micro", "swin_undis_nano",
-]  # fmt: skip
+SwinName = Literal["swin_small", "swin_tiny", "swin_micro", "swin_nano"]
 UnetName = Literal[
     "darswin_unet_a_small", "darswin_unet_a_tiny", "darswin_unet_a_micro", "darswin_unet_a_nano",
     "darswin_unet_ra_small", "darswin_unet_ra_tiny", "darswin_unet_ra_micro",
     "darswin_unet_ra_nano", "swin_unet_small", "swin_unet_tiny", "swin_unet_micro",
-    "swin_unet_nano", "swin_unet_undis_small", "swin_unet_undis_tiny", "swin_unet_undis_micro",
-    "swin_unet_undis_nano", "swin_unet_adapted_small", "swin_unet_adapted_tiny",
-    "swin_unet_adapted_micro", "swin_unet_adapted_nano",
+    "swin_unet_nano",
 ]  # fmt: skip
 ConvUnetName = Literal["conv_unet_small", "conv_unet_tiny", "conv_unet_micro", "conv_unet_nano"]
 
@@ -96,7 +91,9 @@ def create_model(
         features_only: makes a `FeatureMaps`, which returns the maps of an encoder's stages.
         out_indices, output_fmt: the options of `FeatureMaps`.
         pretrained: True is an error, because `load_model` loads trained models.
-        options: arguments of the model's class, in place of the defaults for this name.
+        options: arguments of the model's class, in place of the defaults for this name. `view` may
+            also be the arguments of `make_view`, as in the card of a model:
+            `dict(name="mercator", size=64, fov=2.0)`.
 
     Raises:
         ValueError: the name is unknown, or the options do not fit together.

@@ -10,11 +10,11 @@ from darswin.layers.attention import WindowAttention, check_heads
 from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
-from darswin.lens.spacing import Spacing
 from darswin.models.registry import register_model
 from darswin.models.stages import StageSizes
 from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
+from darswin.views import View
 from darswin.views.base import Pair, PerChannel
 
 
@@ -63,14 +63,14 @@ class DeformableAttention(nn.Module):
         offset = torch.tanh(self.offset(F.gelu(self.norm(around))))  # (B·G, H, W, 2): y, x
         # Positions in the map, in units of its half sides: -1 … 1 from edge to edge.
         pixels = _pixel_centers(height, width, offset)
-        places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
+        points = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
         # The released code samples as if the centres of the outermost pixels were at the edges.
-        sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
+        sampled = F.grid_sample(self._grouped(x), points.flip(-1), align_corners=True)
         sampled = sampled.unflatten(0, (batch, self.groups)).permute(0, 3, 4, 1, 2)
         sampled = sampled.reshape(batch, tokens, dim)
         k, v = self.kv(sampled).chunk(2, 2)
 
-        reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2
+        reach = (pixels.flatten(0, 1)[:, None] - points.flatten(1, 2)[:, None]) / 2
         table = table.unflatten(1, (self.groups, -1))
         table = table.expand(batch, -1, -1, -1, -1).flatten(0, 1)
         bias = F.grid_sample(table, reach.flip(-1), align_corners=True)  # (B·G, heads/G, N, N)
@@ -137,12 +137,9 @@ class DAT(Swin):
         blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
         groups: Sequence[int] = (1, 1, 3, 6),
         offset_range: float = 2.0,
-        view: str = "none",
-        max_fov: float | None = None,
-        spacing: Spacing | None = None,
-        theta_max: float | None = None,
-        mean: PerChannel = 0.0,
-        std: PerChannel = 1.0,
+        view: str | View = "none",
+        mean: PerChannel | None = None,
+        std: PerChannel | None = None,
     ):
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
@@ -155,8 +152,7 @@ class DAT(Swin):
         super().__init__(
             num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate, image_size=image_size, patch_size=patch_size,
-            window=window, view=view, max_fov=max_fov, spacing=spacing, theta_max=theta_max,
-            mean=mean, std=std,
+            window=window, view=view, mean=mean, std=std,
         )  # fmt: skip
 
     def downsample(self, dim: int, merge: Pair) -> nn.Module:

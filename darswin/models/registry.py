@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
+from darswin.models.described import renewed
 from darswin.utils.nearest import did_you_mean
+from darswin.views import View, make_view
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
@@ -62,6 +64,9 @@ def model_class(name: str) -> type[Model]:
     """The class of the model with this name; ValueError for an unknown name."""
     if name in list_pretrained():
         raise ValueError(f"{name!r} is a trained model: load_model({name!r}) loads it")
+    model, options = renewed(name, {})
+    if model != name:
+        raise ValueError(f"{name!r} is now {model!r} with the options {options}")
     if name not in _MODELS:
         raise ValueError(f"unknown model {name!r}{nearest_models(name, list_models())}")
     return _MODELS[name][0]
@@ -78,9 +83,23 @@ def preset(name: str) -> dict[str, Any]:
     return dict(_MODELS[name][2])
 
 
-def make(name: str, **options: object) -> Model:
+def make(name: str, **options: Any) -> Model:
     """A new model with this name, with these options in place of those of `preset`."""
-    return _MODELS[name][1](**(preset(name) | options))
+    options = preset(name) | options
+    if isinstance(options.get("view"), Mapping):
+        options["view"] = _view(options)
+    return _MODELS[name][1](**options)
+
+
+def _view(options: dict[str, Any]) -> View:
+    """The view that `options` describe; takes what it needs out of them."""
+    given = {"size": options.pop("size", None) or options.get("image_size"), **options["view"]}
+    if "name" not in given:
+        raise ValueError(f"view must have a name, got {options['view']}")
+    for key, usual in (("mean", 0.0), ("std", 1.0)):
+        value = options.pop(key, None)
+        given.setdefault(key, usual if value is None else value)
+    return make_view(**given)
 
 
 def has_image_size(name: str) -> bool:

@@ -15,6 +15,7 @@ from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import short
 from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
+from darswin.models.described import described, renewed
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, list_pretrained, no_weights, pretrained_file
@@ -34,7 +35,8 @@ class ModelCard:
 
     Args:
         model: the name of the model, for `create_model`.
-        options: the options of the model, for `create_model`.
+        options: the options of the model, for `create_model`. The card keeps a view, also a `View`
+            or the name of one, as the arguments of `make_view`.
         classes: the names of the classes, in the order of the logits.
         size: the side of the training images, in pixels.
         fov: the field of view of the training lenses, in rad; 0 if they came from calibrations.
@@ -55,6 +57,9 @@ class ModelCard:
     task: Task = "classification"
     colors: Sequence[Sequence[int]] = field(default_factory=list)
     quantized: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "options", described(self.model, self.options))
 
     @property
     def channels(self) -> int:
@@ -182,7 +187,16 @@ def _parsed(entry: str) -> ModelCard:
         fits, expected = _FIELDS[name]
         if not fits(value):
             raise ValueError(f"its {name} must be {expected}, got {short(value)}")
-    return ModelCard(**known)
+    try:
+        return card_of(known)
+    except TypeError as error:  # of an angle that is no number
+        raise ValueError(f"its options {short(known['options'])} have a wrong type") from error
+
+
+def card_of(values: Mapping[str, Any]) -> ModelCard:
+    """The card with these fields, which an older darswin may have written."""
+    model, options = renewed(values["model"], values.get("options", {}))
+    return ModelCard(**{**values, "model": model, "options": options})
 
 
 def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Encoder | PixelModel:

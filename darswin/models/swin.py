@@ -6,20 +6,18 @@ from torch import nn
 
 from darswin.layers.attention import WindowAttention
 from darswin.layers.embed import PatchEmbed
-from darswin.lens.spacing import Spacing
+from darswin.models.base import view_of_model
 from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StageSizes, stage_sizes
-from darswin.ops.checks import per_channel, side_or_pair
-from darswin.views import make_view
-from darswin.views.base import Pair, PerChannel, check_one_picture
-from darswin.views.directions import Vector
+from darswin.ops.checks import side_or_pair
+from darswin.views import View
+from darswin.views.base import Pair, PerChannel, size_of
 
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 
 
 @register_model("swin", presets=_PRESETS, image_size=64)
-@register_model("swin_undis", presets=_PRESETS, image_size=64, view="perspective")
 class Swin(Encoder):
     """The Swin Transformer, on images of a single size.
 
@@ -29,14 +27,11 @@ class Swin(Encoder):
         image_size: (H, W) in pixels, or the side of a square.
         patch_size: the side of a patch, in pixels.
         window: (rows, columns) on maps that are large enough.
-        view: the name of a view whose pixels the network sees, one of `list_views()`. "none" takes
-            the images as they are and ignores the lens. The others resample the images to a view
-            through the lens.
-        size: (H', W') of the view in pixels, or the side of a square; None means image_size.
-        max_fov, spacing, theta_max, fov, up, direction: options of the view; None means the view's
-            own default, and views refuse the options of others.
-        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
-            point are not normalized.
+        view: what the network sees of the images through their lenses: a `View`, which has its own
+            size, mean and std; or the name of one, `list_views()`, of (H, W) and with its own
+            defaults. "none" takes the images as they are and ignores the lens.
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`, by default with 0 and
+            1; images in floating point are not normalized.
 
     Raises:
         ValueError: an unknown option, a view of several pictures, or sizes that do not divide; in
@@ -62,30 +57,18 @@ class Swin(Encoder):
         image_size: int | Pair = 64,
         patch_size: int = 2,
         window: Pair = (4, 4),
-        view: str = "none",
-        size: int | Pair | None = None,
-        max_fov: float | None = None,
-        spacing: Spacing | None = None,
-        theta_max: float | None = None,
-        fov: float | None = None,
-        up: Vector | None = None,
-        direction: Vector | None = None,
-        mean: PerChannel = 0.0,
-        std: PerChannel = 1.0,
+        view: str | View = "none",
+        mean: PerChannel | None = None,
+        std: PerChannel | None = None,
     ):
         super().__init__(
             num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate
         )
         self.image_size = side_or_pair("image_size", image_size)
-        height, width = seen = self.image_size if size is None else side_or_pair("size", size)
-        if view == "none" and seen != self.image_size:
-            raise ValueError(f"size must be image_size = {self.image_size} for the view 'none'")
-        self.view = make_view(
-            view, seen, max_fov=max_fov, spacing=spacing, theta_max=theta_max, fov=fov,
-            up=up, direction=direction,
-            mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
-        )  # fmt: skip
-        check_one_picture(self.view)
+        self.view = view_of_model(view, self.image_size, in_chans, mean, std)
+        height, width = seen = size_of(self.view) or self.image_size
+        if not self.view.uses_lens and seen != self.image_size:
+            raise ValueError(f"the view must have image_size = {self.image_size}, got {seen}")
         if patch_size < 1 or height % patch_size or width % patch_size:
             raise ValueError(f"patch_size must divide the view's (H, W) = {seen}, got {patch_size}")
         rows, columns = height // patch_size, width // patch_size

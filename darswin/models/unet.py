@@ -104,12 +104,11 @@ class Unet(PixelModel):
     read the image, then add the details that the map is too coarse for, and predict. For "distance"
     they also read the viewing direction of each pixel.
 
-    The network sees the images as its encoder does. `create_model` makes four kinds:
+    The network sees the images as its encoder does. `create_model` makes two kinds:
 
     - "darswin_unet" is DarSwin-Unet. DarSwin takes images of any size through any lens.
-    - "swin_unet" is Swin-Unet. Swin takes the images as they are and ignores the lens.
-    - "swin_unet_undis" is Swin-Unet on perspective views. Pixels outside the view get 0.
-    - "swin_unet_adapted" is Swin-Unet on the image disc, mapped to a square as in `LensAdapter`.
+    - "swin_unet" is Swin-Unet. Swin takes the images as they are and ignores the lens, or takes a
+      `view` of them. Pixels outside the view get 0.
 
     The encoder can start from the weights of a trained classifier:
     `classifier.reset_classifier(0)`, `model.encoder.load_state_dict(classifier.state_dict())`.
@@ -236,8 +235,6 @@ def darswin_unet(view: Literal["polar"] = "polar", **options: Any) -> Unet:
 
 
 @register_model("swin_unet", kind=Unet, image_size=128, presets=_PLAIN)
-@register_model("swin_unet_undis", kind=Unet, view="perspective", image_size=128, presets=_PLAIN)
-@register_model("swin_unet_adapted", kind=Unet, view="square", image_size=128, presets=_PLAIN)
 def swin_unet(**options: Any) -> Unet:
     """A `Unet` with a Swin encoder of patches of 4 × 4 pixels, from the options of both."""
     return _unet(Swin, dict(patch_size=4) | options)

@@ -8,6 +8,7 @@ from torch import nn
 
 from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
+from darswin.models.described import described
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, model_class, nearest_models, preset
@@ -76,7 +77,7 @@ def settle(
     if model["name"] not in (None, name):
         raise refuse("name", model["name"], card.model)
     own = own_options(card, name)
-    options = dict(model["options"] or {})
+    options = described(name, model["options"] or {})
     for option, value in options.items():
         # A new decoder has its own options.
         if option not in own and name != card.model:
@@ -101,6 +102,8 @@ def settle(
 
 def _plain(value: Any) -> Any:
     """The value with lists in place of tuples, as in JSON."""
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 

@@ -1,5 +1,8 @@
 """What a network sees of a picture through a lens: one file for each view, registered by name."""
 
+import importlib
+import pkgutil
+
 from darswin.views.base import (
     PixelGrid,
     PolarGrid,
@@ -8,9 +11,10 @@ from darswin.views.base import (
 from darswin.views.camera import CameraView
 from darswin.views.crop import CropView
 from darswin.views.cylindrical import CylindricalView
-from darswin.views.directions import RayView, turned, up_of
+from darswin.views.directions import RayView
 from darswin.views.equirectangular import EquirectangularView
 from darswin.views.mercator import MercatorView
+from darswin.views.orientation import turned, up_of
 from darswin.views.panorama import PanoramaView
 from darswin.views.perspective import PerspectiveView
 from darswin.views.pixels import PixelView
@@ -20,7 +24,6 @@ from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.remap import Remap
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
-from darswin.views.tangent import TangentView
 from darswin.views.tiles import TilesView
 from darswin.views.turn import Turn
 
@@ -41,7 +44,6 @@ __all__ = [
     "Remap",
     "SquareView",
     "StereographicView",
-    "TangentView",
     "TilesView",
     "Turn",
     "View",
@@ -51,3 +53,6 @@ __all__ = [
     "turned",
     "up_of",
 ]
+
+for _module in pkgutil.iter_modules(__path__):  # each registers its view
+    importlib.import_module(f"{__name__}.{_module.name}")

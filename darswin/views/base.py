@@ -130,12 +130,15 @@ class View(nn.Module):
         in_pixels: True if the network sees pixels (B, C, H', W'), False for tokens (B, R, A, S).
         coordinates: the number of coordinates of a token's position.
         count: the number of pictures that the network sees of each image.
+        made: the name, size and options by which `make_view` made the view; its class alone has
+            None.
     """
 
     uses_lens = True
     in_pixels = True
     coordinates = 2
     count = 1
+    made: dict[str, Any] | None = None
 
     def __init__(self, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0):
         super().__init__()
@@ -247,6 +250,14 @@ def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
             f"sampled must have the size of the view, (H, W) = {size}, got {tuple(seen.shape[2:])}"
         )
     return seen
+
+
+def size_of(view: View) -> Pair | None:
+    """(H', W') of what a network sees by a view of pixels; None for a view of any images."""
+    if not view.in_pixels:
+        raise ValueError(f"the network needs a view of pixels, got {view}")
+    size: Pair | None = getattr(view, "size", None) or getattr(view, "map_size", None)
+    return size
 
 
 def check_one_picture(view: View) -> None:

@@ -16,6 +16,7 @@ class CylindricalView(RayView):
     """
 
     upright = True
+    aspect = 1 / 2
 
     def to_plane(self, rays: Tensor) -> Tensor:
         level = length_of(rays[..., ::2])

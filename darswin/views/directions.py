@@ -2,8 +2,7 @@
 
 import copy
 import math
-from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -13,15 +12,11 @@ from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_grid, ray_channels
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, readable, tensor_there
-from darswin.utils.angles import check_turn, degrees_hint
-from darswin.utils.arrays import as_tensor
+from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel, check_lens
+from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
 from darswin.views.pixels import PixelView
 
-Vector = Sequence[float] | Tensor
-
-PICTURE_TOP = (0.0, -1.0, 0.0)
-AXIS = (0.0, 0.0, 1.0)
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
 _STEPS, _BISECTIONS = 361, 12  # points at which the end of what a lens sees is looked for
 _LEAST_STEP = 1e-9  # of a view whose middle the picture does not show
@@ -64,8 +59,9 @@ class RayView(PixelView):
     size: Pair
     upright = False  # True if all columns are vertical in the world, and not only the middle one
     around = False  # True if a view shows all around the horizon, and not as much as the lens
-    reach = math.pi  # the largest angle from the middle that a view of a whole lens shows, rad
+    usual_fov = 2 * math.pi  # at most, of a view of a whole lens, rad
     widest = 2 * math.pi  # the largest fov
+    aspect: float | None = None  # the usual H'/W'; None means that of the images
 
     def __init__(
         self,
@@ -91,6 +87,15 @@ class RayView(PixelView):
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
         self._known: tuple[Tensor, Tensor] | None = None
+
+    @classmethod
+    def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
+        """The field of view, rad, and H'/W' of a view of all that images of (H, W) show in the row
+        of the principal point, or of `fov`."""
+        if fov is None:
+            across, _ = fields_of_view(lens, size)
+            fov = cls.widest if cls.around else min(across, cls.usual_fov)
+        return fov, size[0] / size[1] if cls.aspect is None else cls.aspect
 
     def for_lens(self, lens: Lens, size: Pair) -> Self:
         # What the view covers takes most of the time of `to_view`.
@@ -209,7 +214,7 @@ class RayView(PixelView):
         # Upright views are as wide as the lens sees on the horizon, if it sees that at all.
         horizon = torch.zeros_like(start)
         row = torch.where(self._sees(lens, horizon[None], size)[..., None], horizon, start)[:, 0]
-        edge = row.new_tensor([self.half_width(self.reach), 0.0])
+        edge = row.new_tensor([self.half_width(self.usual_fov / 2), 0.0])
         begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
         ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
         goals = torch.stack(torch.broadcast_tensors(*ends), 1)
@@ -240,7 +245,7 @@ class RayView(PixelView):
     def _highest(self, start: Tensor, sign: int) -> Tensor:
         """The end of the column at `start`, (1, 2), upwards (-1) or downwards (1)."""
         if not self.upright:
-            return start.new_tensor([[0.0, sign * self.half_width(self.reach)]])
+            return start.new_tensor([[0.0, sign * self.half_width(self.usual_fov / 2)]])
         steepest = (0.0, sign * math.sin(_STEEPEST), math.cos(_STEEPEST))
         return self.to_plane(start.new_tensor([steepest]))
 
@@ -289,94 +294,21 @@ def check_sees(points: Tensor, view: PixelView, lens: Lens, size: Pair) -> Tenso
     return points
 
 
-def unit_vector(name: str, vector: Vector) -> tuple[float, float, float]:
-    """The unit vector of three finite numbers that are not all 0; ValueError otherwise."""
-    try:
-        values = [float(x) for x in (vector.tolist() if hasattr(vector, "tolist") else vector)]
-    except (TypeError, ValueError):
-        values = []
-    length = math.hypot(*values)
-    if len(values) != 3 or not 0 < length < math.inf:
-        raise ValueError(f"{name} must be three finite numbers that are not all 0, got {vector!r}")
-    x, y, z = (value / length for value in values)
-    return x, y, z
+def sides(lens: Lens, size: Pair) -> Tensor:
+    """The `side_angles` of one lens, (4,) rad; negative if the principal point lies beyond that
+    side."""
+    cx, cy = lens.center_in(size)[0].tolist()
+    height, width = size
+    past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
+    angles = lens.side_angles(size)[0]
+    return torch.where(torch.tensor(past), -angles, angles)
 
 
-def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> list[list[float]]:
-    """The rotation (3, 3) from the frame of a view to the camera's: its columns are the view's x, y
-    and z.
-
-    z is `direction`, and x is level. If the view is `upright`, y is straight down, and z is the
-    level part of `direction`. Where `direction` is straight up or down, the picture's top is level.
-    """
-    above, ahead = torch.tensor([up, direction], dtype=torch.float64)
-    right = torch.linalg.cross(ahead, above)
-    if right.norm() < 1e-6:
-        ahead_of_level = torch.tensor(PICTURE_TOP, dtype=torch.float64)
-        if torch.linalg.cross(ahead_of_level, above).norm() < 1e-6:
-            ahead_of_level = torch.tensor(AXIS, dtype=torch.float64)
-        right = torch.linalg.cross(ahead_of_level, above)
-    axis = above if upright else ahead
-    right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
-    right = right / right.norm()
-    down = -above if upright else torch.linalg.cross(ahead, right)
-    forward = torch.linalg.cross(right, down) if upright else ahead
-    return torch.stack((right, down, forward), 1).tolist()
-
-
-def up_of(
-    roll: float = 0.0, pitch: float = 0.0, *, extrinsics: Tensor | Sequence | None = None,
-    world_up: Vector = (0.0, 0.0, 1.0),
-) -> tuple[float, float, float]:  # fmt: skip
-    """The direction away from gravity in a camera's frame, for the argument `up` of views.
-
-    Args:
-        roll: the angle by which the camera is turned clockwise about its optical axis, as seen from
-            behind it, in [-2π, 2π] rad.
-        pitch: the angle by which the optical axis is raised above the horizon, in [-2π, 2π] rad.
-        extrinsics: in place of roll and pitch, the rotation (3, 3) or pose (3 or 4, 4) that takes
-            vectors of the camera to the world's or the vehicle's frame.
-        world_up: the direction away from gravity in that frame.
-
-    Raises:
-        ValueError: an angle is out of range, roll and pitch are given with extrinsics, or these
-            hold no rotation.
-    """
-    check_turn("roll", roll)
-    check_turn("pitch", pitch)
-    if extrinsics is None:
-        level = math.cos(pitch)
-        up = (-level * math.sin(roll), -level * math.cos(roll), math.sin(pitch))
-        return unit_vector("up", up)
-    if roll or pitch:
-        raise ValueError("give either extrinsics, or roll and pitch")
-    pose = as_tensor(extrinsics, torch.float64)
-    shape = tuple(pose.shape)
-    rotation = pose[:3, :3] if shape in ((3, 3), (3, 4), (4, 4)) else pose.new_zeros(3, 3)
-    turns = torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-4)
-    if not (turns and torch.linalg.det(rotation) > 0):
-        raise ValueError(f"extrinsics must be a rotation (3, 3) or a pose (4, 4), got {extrinsics}")
-    above = torch.tensor(unit_vector("world_up", world_up), dtype=torch.float64)
-    return unit_vector("up", rotation.T @ above)
-
-
-def turned(yaw: float = 0.0, pitch: float = 0.0) -> dict[str, Any]:
-    """The options `up` and `direction` of a view that looks `yaw` to the right and `pitch` up.
-
-    The view is pitched about the camera's x axis first, and then turned about its y axis. Give the
-    `direction` alone to a view that stays level with another `up`.
-
-    Args:
-        yaw, pitch: in [-2π, 2π] rad.
-    """
-    check_turn("yaw", yaw)
-    check_turn("pitch", pitch)
-    ahead, above = math.cos(pitch), math.sin(pitch)
-    right, forward = math.sin(yaw), math.cos(yaw)
-    return dict(
-        up=(-above * right, -ahead, -above * forward),
-        direction=(ahead * right, -above, ahead * forward),
-    )
+def fields_of_view(lens: Lens, size: Pair) -> tuple[float, float]:
+    """The horizontal and the vertical field of view up to θ_max in pictures of (H, W), rad."""
+    end = lens.theta_max.item()
+    left, top, right, bottom = sides(lens, size).clamp(-end, end).tolist()
+    return min(left + right, 2 * math.pi), min(top + bottom, math.pi)
 
 
 def _row(values: Tensor, dim: int) -> Tensor:

@@ -5,8 +5,10 @@ import math
 import torch
 from torch import Tensor
 
+from darswin.lens import Lens
 from darswin.lens.solve import length_of
-from darswin.views.directions import RayView
+from darswin.views.base import Pair
+from darswin.views.directions import RayView, fields_of_view
 from darswin.views.registry import register_view
 
 
@@ -19,6 +21,13 @@ class EquirectangularView(RayView):
     """
 
     upright = True
+
+    @classmethod
+    def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
+        fov, _ = super().usual_shape(lens, size, fov)
+        # The height of all that the picture shows; narrower views keep this shape.
+        across, down = fields_of_view(lens, size)
+        return fov, down / max(fov, across)
 
     def to_plane(self, rays: Tensor) -> Tensor:
         level = length_of(rays[..., ::2])

@@ -14,3 +14,4 @@ class PanoramaView(MercatorView):
     """
 
     around = True
+    aspect = 1 / 3

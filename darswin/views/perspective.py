@@ -1,64 +1,75 @@
-"""A perspective view of each image, as an ideal camera without distortion would see it."""
+"""A perspective picture in one direction, as of a camera without distortion that looks there."""
 
 import math
 
+import torch
 from torch import Tensor
 
-from darswin.lens import Lens, pixels
+from darswin.lens import Lens
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel
-from darswin.views.pixels import PixelView
+from darswin.views.directions import RayView
+from darswin.views.orientation import Vector
 from darswin.views.registry import register_view
 
 
 @register_view("perspective")
-class PerspectiveView(PixelView):
-    """A perspective view of each image, with the field of view of the lens, but `max_fov` at most.
+class PerspectiveView(RayView):
+    """A perspective picture around one `direction`: straight lines stay straight.
 
-    Pixels of the images that are outside the view get 0 on the way back.
+    This is the picture for a network that looks at one thing, such as a classifier. It gets coarse
+    in the middle above 100°, so a view of a whole lens ends there. The other arguments and the
+    errors are those of `RayView`, but `fov` is below π.
 
     Args:
-        size: (H', W') of the view.
-        max_fov: the largest field of view, in (0, π) rad.
-        mean, std: the arguments of `View`.
-
-    Raises:
-        ValueError: max_fov is out of range.
+        reach: in place of `fov`, the angle between `direction` and the nearest edges, in (0, π/2)
+            rad, but θ_max of each lens where that is less, also if the picture ends before.
     """
 
-    size: Pair
+    usual_fov = math.radians(100)
+    widest = math.radians(179.9)
 
     def __init__(
         self,
         size: Pair,
-        max_fov: float = math.radians(175),
+        fov: float | None = None,
+        theta_max: float | None = None,
         *,
+        reach: float | None = None,
+        up: Vector | None = None,
+        direction: Vector | None = None,
+        reads: int | None = None,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
-        super().__init__(size, mean=mean, std=std)
-        if not 0 < max_fov < math.pi:
-            hint = degrees_hint(max_fov)
-            raise ValueError(f"max_fov must be in (0, π), got {max_fov}{hint}")
-        self.max_fov = float(max_fov)
+        super().__init__(
+            size, fov, theta_max, up=up, direction=direction, reads=reads, mean=mean, std=std
+        )
+        if reach is not None and not 0 < reach <= self.widest / 2:
+            hint = degrees_hint(reach)
+            raise ValueError(f"reach must be in (0, {self.widest / 2:.4g}] rad, got {reach}{hint}")
+        if reach is not None and fov is not None:
+            raise ValueError(f"give either fov or reach, got {fov} and {reach}")
+        self.reach = reach
 
-    def image_points(self, lens: Lens, size: Pair) -> Tensor:
-        return pixels.reprojection(lens, size, self._lens(lens), self.size)
+    def half_width(self, angle: float) -> float:
+        return math.tan(angle)
 
-    def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        return pixels.reprojection(self._lens(lens), self.size, lens, size)
+    def to_plane(self, rays: Tensor) -> Tensor:
+        ahead = rays[..., 2:]
+        flat = rays[..., :2] / torch.where(ahead > 0, ahead, 1.0)
+        return torch.where(ahead > 0, flat, torch.nan)
 
-    def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
-        return pixels.pixel_rays(self._lens(lens), self.size)
+    def from_plane(self, points: Tensor) -> Tensor:
+        length = torch.rsqrt(1 + points.square().sum(-1, keepdim=True))
+        return torch.cat((points * length, length), -1)
 
-    def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
-        return self._lens(lens).unproject_points(points, self.size)
-
-    def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
-        return self._lens(lens).project_points(rays, self.size)
-
-    def _lens(self, lens: Lens) -> Lens:
-        return pixels.perspective_view(lens, self.size, self.max_fov)
+    def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        if self.reach is None:
+            return super()._layout(lens, size)
+        half = torch.tan(lens.theta_max.detach().clamp(max=self.reach))
+        return 2 * half[:, None] / min(self.size), half.new_zeros(1, 2)
 
     def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, max_fov={self.max_fov:g}"
+        reach = "" if self.reach is None else f", reach={self.reach:.4g}"
+        return f"{super().extra_repr()}{reach}"

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from darswin.ops.checks import side_or_pair
 from darswin.views.base import Pair, PerChannel, View
 
 _VIEWS: dict[str, Callable[..., View]] = {}
@@ -28,30 +29,48 @@ def list_views() -> list[str]:
     return sorted(_VIEWS)
 
 
+def flat_views() -> list[str]:
+    """The names of the views of one picture that people look at: they have a `usual_shape`."""
+    return [name for name in list_views() if hasattr(_VIEWS[name], "usual_shape")]
+
+
+def view_class(name: str) -> Any:
+    """The class with this name, or the function that makes the view; ValueError for others."""
+    if name not in _VIEWS:
+        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
+    return _VIEWS[name]
+
+
 def make_view(
     name: str,
-    size: Pair | None,
+    size: int | Pair | None,
     *,
     mean: PerChannel | None = 0.0,
     std: PerChannel | None = 1.0,
     **options: Any,
 ) -> View:
-    """The view with this name, of (H', W'); "none" also takes None, for images of any size.
+    """The view with this name.
 
     Args:
+        name: one of `list_views()`.
+        size: (H', W') in pixels, or the side of a square; "none" also takes None, for images of any
+            size.
         mean, std: the arguments of `View`.
         options: the other arguments of the view. None stands for the default of an argument.
 
     Raises:
-        ValueError: the name is unknown.
-        TypeError: the view has no such option.
+        ValueError: the name is unknown, or an argument is out of range.
+        TypeError: the view has no such option, or the size is no int and no pair of ints.
     """
-    if name not in _VIEWS:
-        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
-    make, given = _VIEWS[name], {k: value for k, value in options.items() if value is not None}
-    given |= dict(mean=mean, std=std)
+    make = view_class(name)
+    options = {k: value for k, value in options.items() if value is not None}
+    given = options | dict(mean=mean, std=std)
+    pair = None if size is None else side_or_pair("size", size)
     try:
-        inspect.signature(make).bind(size, **given)
+        inspect.signature(make).bind(pair, **given)
     except TypeError as error:
         raise TypeError(f"the view {name!r} has no such option: {error}") from error
-    return make(size, **given)
+    view = make(pair, **given)
+    plain = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items()}
+    view.made = dict(name=name, size=pair, **plain)
+    return view

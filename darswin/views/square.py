@@ -1,5 +1,7 @@
 """The image disc as a square."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,8 @@ from darswin.lens.concentric import (
 )
 from darswin.lens.pixels import OUTSIDE
 from darswin.lens.solve import length_of, vector_of
-from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
+from darswin.lens.spacing import SPACINGS, Spacing
+from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel
 from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
@@ -27,16 +30,16 @@ class SquareView(PixelView):
 
     Args:
         size: (S, S) of the view.
+        fov: the horizontal field of view between the outer edges of the middle row, rad. None means
+            twice θ_max of each lens. The size of a thing in the square then depends on the lens,
+            and the network is not told. If sizes matter, as for distances, give that of your widest
+            lens. The square is 0 beyond θ_max of a lens.
         spacing: the spacing from the centre of the square to its edge; see `darswin.lens.spacing`.
-        theta_max: θ at the edge of the square, rad. None means θ_max of each lens. The size of a
-            thing in the square then depends on the lens, and the network is not told. If sizes
-            matter, as for distances, give the widest θ_max of your lenses. The square is 0 beyond
-            θ_max of a lens.
         mean, std: the arguments of `View`.
 
     Raises:
-        ValueError: the view is not square, the spacing is unknown, or theta_max is not in (0, π) or
-            has another spacing than "theta".
+        ValueError: the view is not square, the spacing is unknown, or fov is not in (0, 2π] or has
+            another spacing than "theta".
     """
 
     size: Pair
@@ -44,9 +47,9 @@ class SquareView(PixelView):
     def __init__(
         self,
         size: Pair,
-        spacing: Spacing = "theta",
-        theta_max: float | None = None,
+        fov: float | None = None,
         *,
+        spacing: Spacing = "theta",
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
@@ -54,10 +57,19 @@ class SquareView(PixelView):
         if spacing not in SPACINGS:
             raise ValueError(f"spacing must be one of {SPACINGS}, got {spacing!r}")
         if size[0] != size[1]:
-            raise ValueError(f"image_size must be square, got {size}")
-        if theta_max is not None:
-            check_fixed_theta_max(theta_max, spacing)
-        self.spacing, self.theta_max = spacing, theta_max
+            raise ValueError(f"size must be square, got {size}")
+        if fov is not None and not 0 < fov <= 2 * math.pi:
+            raise ValueError(f"fov must be in (0, 2π] rad, got {fov}{degrees_hint(fov)}")
+        if fov is not None and spacing != "theta":
+            raise ValueError(f"a square with fov needs spacing='theta', got {spacing!r}")
+        self.spacing, self.fov = spacing, fov
+        # Its edge is before π, where all directions are one.
+        self.theta_max = None if fov is None else min(fov / 2, math.nextafter(math.pi, 0))
+
+    @classmethod
+    def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
+        """`RayView.usual_shape`, of all up to θ_max."""
+        return 2 * lens.theta_max.item() if fov is None else fov, 1.0
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
@@ -86,5 +98,5 @@ class SquareView(PixelView):
         return torch.where(square == OUTSIDE, torch.nan, points)
 
     def extra_repr(self) -> str:
-        edge = "" if self.theta_max is None else f", theta_max={self.theta_max:g}"
+        edge = "" if self.fov is None else f", fov={self.fov:g}"
         return f"{super().extra_repr()}, spacing={self.spacing!r}{edge}"

@@ -16,8 +16,7 @@ class StereographicView(RayView):
     The middle column is level with `up`. The arguments and errors are those of `RayView`.
     """
 
-    reach = math.radians(170)
-    widest = 2 * reach
+    usual_fov = widest = math.radians(340)
 
     def half_width(self, angle: float) -> float:
         return 2 * math.tan(angle / 2)

@@ -18,14 +18,8 @@ from darswin.views.base import (
     check_count,
     check_seen_images,
 )
-from darswin.views.directions import (
-    AXIS,
-    PICTURE_TOP,
-    Vector,
-    check_sees,
-    frame_of,
-    unit_vector,
-)
+from darswin.views.directions import check_sees
+from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
 from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 from darswin.views.stereographic import StereographicView
@@ -55,8 +49,8 @@ class TilesView(PixelView):
         size: (H', W') of a tile. Tiles that are much smaller than 512 pixels find less than one
             view of the whole picture.
         count: n, from 4 to 9.
-        fov: the field of view that the tiles cover together, rad. The default suits lenses of 165°
-            and more.
+        fov: the horizontal field of view that the tiles cover together, rad. The default suits
+            lenses of 165° and more.
         theta_max: the largest incident angle that is shown, rad; None means θ_max of each lens.
         tile_fov: the horizontal field of view of a tile, rad; None suits `count` and `fov`.
         directions: (n, 3), the middles of the tiles in the camera's frame, in place of `count`,

@@ -7,7 +7,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from darswin.calibrate import Calibration
+from darswin.calibrate import CalibratedLens
 from darswin.lens import Lens
 from darswin.viz.plot import HATCH, TEXT, page_figure
 
@@ -15,7 +15,7 @@ STEPS = 60  # of the map, along the image's longer side
 LONGEST = 0.08  # of the image's width: the arrow of a residual that 95 % do not exceed
 
 
-def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Figure:
+def draw_calibration(found: CalibratedLens, corners: np.ndarray, lens: Lens) -> Figure:
     """Draws the corners coloured by θ, their residuals, the standard deviation of the projection
     over the picture, and r(θ) with twice its standard deviation.
 
@@ -26,11 +26,11 @@ def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Fig
     figure = page_figure(6.4)
     panels = figure.subplot_mosaic([["corners", "residuals"], ["map", "curve"]])
     seen = ~torch.isnan(found.theta).numpy()
-    places, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
+    points, misses = np.asarray(corners)[seen], found.residuals.numpy()[seen]
     theta, counts = torch.rad2deg(found.theta).numpy()[seen], found.weights.numpy()[seen] > 0.1
-    dots = panels["corners"].scatter(places[:, 0], places[:, 1], c=theta, s=3, lw=0)
+    dots = panels["corners"].scatter(points[:, 0], points[:, 1], c=theta, s=3, lw=0)
     figure.colorbar(dots, ax=panels["corners"], location="bottom", pad=0.02, label="θ (°)")
-    _draw_residuals(panels["residuals"], places, misses, counts, lens)
+    _draw_residuals(panels["residuals"], points, misses, counts, lens)
     _draw_map(panels["map"], found, lens)
     _draw_curve(panels["curve"], found, lens)
     height, width = lens.image_size[0].tolist()
@@ -52,7 +52,7 @@ def draw_calibration(found: Calibration, corners: np.ndarray, lens: Lens) -> Fig
 
 
 def _draw_residuals(
-    axes: Axes, places: np.ndarray, misses: np.ndarray, counts: np.ndarray, lens: Lens
+    axes: Axes, points: np.ndarray, misses: np.ndarray, counts: np.ndarray, lens: Lens
 ) -> None:
     """Draws arrows from corners to where the lens sees them, red for those that count little."""
     length = np.linalg.norm(misses, axis=1)
@@ -61,14 +61,14 @@ def _draw_residuals(
     # Wrong corners would have arrows across the whole picture.
     shown = misses * np.minimum(1, 2 * usual / length.clip(1e-9))[:, None]
     arrows = axes.quiver(
-        *places.T, *shown.T, color=np.where(counts, "C0", "red"), angles="xy", scale_units="xy",
+        *points.T, *shown.T, color=np.where(counts, "C0", "red"), angles="xy", scale_units="xy",
         scale=usual / (LONGEST * width), width=0.004,
     )  # fmt: skip
     round_ = float(f"{usual:.1g}")
     axes.quiverkey(arrows, 0.5, -0.1, round_, f"{round_:g} px", labelpos="E", color="C0")
 
 
-def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:
+def _draw_map(axes: Axes, found: CalibratedLens, lens: Lens) -> None:
     height, width = lens.image_size[0].tolist()
     step = max(height, width) / STEPS
     y, x = (torch.arange(step / 2 - 0.5, side - 0.5, step).double() for side in (height, width))
@@ -82,7 +82,7 @@ def _draw_map(axes: Axes, found: Calibration, lens: Lens) -> None:
     axes.figure.colorbar(drawn, ax=axes, location="bottom", pad=0.02, label="px", extend="max")
 
 
-def _draw_curve(axes: Axes, found: Calibration, lens: Lens) -> None:
+def _draw_curve(axes: Axes, found: CalibratedLens, lens: Lens) -> None:
     theta = torch.linspace(0, lens.theta_max.item(), 129, dtype=torch.float64)
     degrees, band = torch.rad2deg(theta), 2 * found.uncertainty_of_theta(theta)
     axes.plot(degrees, lens.project(theta), "k-")

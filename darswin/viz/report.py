@@ -10,6 +10,7 @@ from darswin.lens.base import Lens
 from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS, Spacing
 from darswin.views import PolarView
+from darswin.views.directions import sides
 
 __all__ = ["describe"]
 
@@ -40,15 +41,6 @@ def largest_offset(lens: Lens) -> float:
 def beyond_lens(lens: Lens, image_size: tuple[int, int]) -> Tensor:
     """True for each side of the image that lies beyond the lens: (4,), in the order of SIDES."""
     return lens.side_angles(image_size)[0] >= lens.with_theta_max(None).theta_max
-
-
-def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
-    """The `side_angles`, (4,) rad; negative if the principal point lies beyond that side."""
-    cx, cy = lens.center_in(image_size)[0].tolist()
-    height, width = image_size
-    past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
-    angles = lens.side_angles(image_size)[0]
-    return torch.where(torch.tensor(past), -angles, angles)
 
 
 def outside_share(lens: Lens, image_size: tuple[int, int]) -> float:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from darswin.viz.views import undistort
 from PIL import ExifTags, Image
 from videos import turn_video, write_video
 
@@ -19,7 +20,6 @@ from darswin.data.cameras import Calibrations
 from darswin.lens import Equidistant, to_dict
 from darswin.utils.video import read_frames
 from darswin.views import make_view
-from darswin.viz.views import undistort
 
 SIZE = (96, 128)  # of the calibration's pictures
 K = np.array([[52.0, 0.0, 62.0], [0.0, 51.0, 49.5], [0.0, 0.0, 1.0]])
@@ -162,7 +162,7 @@ def test_the_views_show_all_that_the_picture_shows_by_default(folder, capsys):
     lens = Equidistant(50.0, image_size=SIZE)  # 146.7° in the row of the principal point
     (folder / "own.json").write_text(json.dumps(to_dict(lens) | {"theta_max": 64 / 50}))
     for view, fov, size in (
-        ("perspective", 110, "128 × 96 px"),
+        ("perspective", 100, "128 × 96 px"),
         ("cylindrical", 146.7, "128 × 64 px"),
         ("equirectangular", 146.7, "128 × 96 px"),
         ("mercator", 146.7, "128 × 96 px"),
@@ -338,7 +338,7 @@ def test_one_plan_serves_all_pictures_of_one_size(mixed, monkeypatch):
         ),
         (["in", "--view=square", "--up=0,-1,0"], "--up must be left out for a square view"),
         (["in", "--view=panorama", "--fov=300"], "--fov_deg must be 360° for a panorama view"),
-        (["in", "--view=fisheye"], "--view must be one of perspective, cylindrical"),
+        (["in", "--view=fisheye"], "--view must be one of cylindrical, equirectangular"),
         (["in", "--yaw_deg=400"], "--yaw_deg must be from -360° to 360°, got 400"),
         (["in", "--theta_max_deg=0"], "--theta_max_deg must be above 0°"),
         (["in", "--size=0,9"], "--size must be at least 2,2"),

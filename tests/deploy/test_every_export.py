@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from helpers import slow_but
+from helpers import create, slow_but
 from lens_examples import ASIDE, example
 
-from darswin import create_model
 from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import MODELS as LENS_MODELS
@@ -30,25 +29,25 @@ KINDS = {
     "polar bias": ("darswin_a_nano", dict(POLAR, position_bias="polar", harmonics=2)),
     "maps": ("darswin_a_nano", dict(POLAR, **TWO_STAGES, merges=((1, 1),), features_only=True)),
     "swin": ("swin_nano", PLAIN),
-    "perspective": ("swin_undis_nano", dict(PLAIN, **TWO_STAGES)),
+    "perspective": ("swin_nano perspective", dict(PLAIN, **TWO_STAGES)),
     "dat": ("dat_nano", dict(PLAIN, blocks=("D",), groups=(1,))),
     "conv": ("conv_unet_nano", dict(widths=(4, 4), task="distance")),
     "conv mercator": (
         "conv_unet_nano",
-        dict(widths=(4, 4), view="mercator", size=(20, 12), fov=2.0),
+        dict(widths=(4, 4), view=dict(name="mercator", size=(20, 12), fov=2.0)),
     ),
     "unet A": ("darswin_unet_a_nano", dict(POLAR, **TWO_STAGES, merges=((1, 2),), **RAYS)),
     "unet RA": ("darswin_unet_ra_nano", dict(SQUARES, skip_width=2, rays=True)),
     "unet without skip": ("darswin_unet_a_nano", dict(POLAR, skip_width=0, places=False)),
     "unet": ("swin_unet_nano", PLAIN),
-    "unet perspective": ("swin_unet_undis_nano", dict(PLAIN, **RAYS)),
+    "unet perspective": ("swin_unet_nano perspective", dict(PLAIN, **RAYS)),
     "conv whole lens": ("conv_unet_nano", dict(widths=(4,), view="mercator", size=(8, 16))),
     "unet equirectangular": (
         "swin_unet_nano",
-        dict(PLAIN, **RAYS, view="equirectangular", size=(8, 16), fov=2.0),
+        dict(PLAIN, **RAYS, view=dict(name="equirectangular", size=(8, 16), fov=2.0)),
     ),
-    "unet square": ("swin_unet_adapted_nano", dict(PLAIN, **RAYS)),
-    "unet fixed square": ("swin_unet_adapted_nano", dict(PLAIN, **RAYS, theta_max=1.0)),
+    "unet square": ("swin_unet_nano square", dict(PLAIN, **RAYS)),
+    "unet fixed square": ("swin_unet_nano", dict(PLAIN, **RAYS, view=dict(name="square", fov=2.0))),
     "official": (None, {}),
     "adapter": (None, {}),
 }
@@ -64,7 +63,7 @@ def model_of(kind):
         return OfficialDarSwin(num_classes=5, **ONE, **sizes).eval()
     if kind == "adapter":
         return LensAdapter(torch.nn.Conv2d(3, 4, 3, padding=1), SIDE).eval()
-    return create_model(name, **(dict(num_classes=5) | options)).eval()
+    return create(name, **(dict(num_classes=5) | options)).eval()
 
 
 def lenses_of(name):

@@ -8,6 +8,7 @@ import zipfile
 
 import pytest
 import torch
+from helpers import create
 
 from darswin import create_model
 from darswin.compat import OfficialDarSwin
@@ -36,7 +37,7 @@ def short(name, **options):
     options = dict(num_classes=5) | options
     if name == "official":
         return OfficialDarSwin(embed_dim=24, samples=(4, 4), **options).eval()
-    return create_model(name, **options).eval()
+    return create(name, **options).eval()
 
 
 def batch_of(lens, count):
@@ -60,10 +61,14 @@ def tensors_of(lens):
         ("swin_nano", {}, SPHERICAL),
         ("darswin_unet_a_nano", dict(skip_width=4), SPHERICAL),
         ("darswin_unet_ra_nano", dict(ONE_BLOCK, task="distance"), POLYNOMIAL),
-        ("swin_unet_undis_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
-        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32, theta_max=1.5), SPHERICAL),
+        ("swin_unet_nano perspective", dict(ONE_BLOCK, image_size=32), SPHERICAL),
+        (
+            "swin_unet_nano",
+            dict(ONE_BLOCK, image_size=32, view=dict(name="square", fov=3.0)),
+            SPHERICAL,
+        ),
         ("conv_unet_nano", {}, SPHERICAL),
-        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
+        ("swin_unet_nano square", dict(ONE_BLOCK, image_size=32), SPHERICAL),
     ],
 )
 def test_program(name, options, lens, monkeypatch):
@@ -136,10 +141,10 @@ def test_package_in_a_process_without_the_package(tmp_path):
 ONNX_MODELS = {
     "darswin_a_nano": ({}, POLYNOMIAL),
     "darswin_ra_nano": (ONE_BLOCK, POLYNOMIAL[0]),
-    "swin_undis_nano": (ONE_BLOCK, SPHERICAL),
+    "swin_nano perspective": (ONE_BLOCK, SPHERICAL),
     "dat_nano": (dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
     "darswin_unet_a_nano": (ONE_BLOCK, SPHERICAL),
-    "swin_unet_adapted_nano": (dict(ONE_BLOCK, image_size=32, task="distance"), SPHERICAL[0]),
+    "swin_unet_nano square": (dict(ONE_BLOCK, image_size=32, task="distance"), SPHERICAL[0]),
 }
 
 

@@ -48,7 +48,7 @@ def test_large_batches_go_in_parts(monkeypatch, lenses):
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("name", "lenses"),
-    [*itertools.product(["darswin_a_nano", "swin_undis_nano"], [1, 200]),
+    [*itertools.product(["darswin_a_nano", "swin_nano perspective"], [1, 200]),
      *(pytest.param("darswin_unet_a_nano", n, marks=pytest.mark.slow) for n in (1, 200))],
 )  # fmt: skip
 def test_large_batches_have_the_bits_of_small_ones(name, lenses):
@@ -64,7 +64,7 @@ def test_large_batches_have_the_bits_of_small_ones(name, lenses):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano", "darswin_unet_a_nano"])
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano perspective", "darswin_unet_a_nano"])
 def test_a_fixed_lens_is_prepared_once_for_each_size(name, monkeypatch):
     model, lens = network(name, mean=0.5, std=0.25), LENSES[:1]
     fixed = optimize(model, lens=lens)
@@ -184,8 +184,8 @@ def test_what_an_optimized_model_does_not_do(name):
             assert torch.equal(fast.eval()(leaf, *arguments), expected)
 
 
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano", "darswin_unet_a_nano",
-                                  "swin_unet_adapted_nano", "conv_unet_nano"])  # fmt: skip
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano perspective", "darswin_unet_a_nano",
+                                  "swin_unet_nano square", "conv_unet_nano"])  # fmt: skip
 def test_a_lens_with_gradients_is_refused(name):
     fast = optimize(network(name, task="distance") if "unet" in name else network(name))
     images = torch.randn(1, 3, *(fast.image_size or (32, 32)))

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 import torch
-from helpers import relative_error
+from helpers import create, relative_error
 from torch import nn
 
-from darswin import create_model, optimize
+from darswin import optimize
 from darswin.deploy import packed
 from darswin.deploy import quantize as module
 from darswin.deploy.quantize import quantize_model, sensitivities
@@ -29,8 +29,8 @@ from darswin.models import ModelCard, load_model, save_model
 from darswin.ops import _module
 
 HAS_VNNI = onednn_lack(torch.int8) is None  # or another exact product of bytes, for other libraries
-MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano",
-          "darswin_unet_a_nano", "swin_unet_adapted_nano"]  # fmt: skip
+MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_nano perspective", "dat_nano",
+          "darswin_unet_a_nano", "swin_unet_nano square"]  # fmt: skip
 
 
 def network(name="darswin_a_nano", **options):
@@ -40,7 +40,7 @@ def network(name="darswin_a_nano", **options):
         options["image_size"] = 32
     if name.startswith("darswin_unet"):
         options |= dict(rings=8, sectors=16)
-    model = create_model(name, **(dict(num_classes=10) | options)).eval()
+    model = create(name, **(dict(num_classes=10) | options)).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
@@ -82,9 +82,9 @@ def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
 
 
 @torch.no_grad()
-def test_calibration_and_quantized_models_come_to_the_same():
+def test_batches_and_quantized_models_come_to_the_same():
     model, seen = network(), batch()
-    direct = optimize(model, torch.int8, calibration=iter([(*seen, torch.zeros(4))]))
+    direct = optimize(model, torch.int8, batches=iter([(*seen, torch.zeros(4))]))
     by_model = optimize(quantize_model(model, [seen]), torch.int8)
     assert torch.equal(direct(*seen), by_model(*seen))
     images, lens = seen
@@ -222,7 +222,7 @@ def test_fastest(monkeypatch):
     monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
     want = optimize(quantized, torch.int8)(*seen)
     assert torch.equal(optimize(quantized, "fastest")(*seen), want)
-    assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
+    assert torch.equal(optimize(model, "fastest", batches=[seen])(*seen), want)
 
 
 @pytest.mark.slow
@@ -283,29 +283,29 @@ def test_wrong_arguments():
     assert sum(isinstance(m, Linear) for m in quantized.modules())  # the head is one still
     images = seen[0].clone()
     images[0, 0, 16, 16] = math.nan
-    for given, calibration, kind, message in (
+    for given, batches, kind, message in (
         (nn.Linear(2, 3), [seen], TypeError, "model of create_model, got Linear"),
         (quantized, [seen], ValueError, "quantized already"),
         *(
-            (model, wrong, TypeError, r"batches \(images, lens\)")
+            (model, wrong, TypeError, r"batches must be of \(images, lens\)")
             for wrong in (seen, seen[0], [(seen[0],)], [seen[0]], [(seen[0], 1.0)])
         ),
         (network().double(), [seen], ValueError, "float32 on the CPU"),
         (network().bfloat16(), [seen], ValueError, "float32 on the CPU"),
-        (model, [], ValueError, "no pictures"),
-        (model, [(seen[0][:0], seen[1])], ValueError, "no pictures"),
+        (model, [], ValueError, "have pictures, got none"),
+        (model, [(seen[0][:0], seen[1])], ValueError, "have pictures, got none"),
         (model, [(images, seen[1])], ValueError, "not finite"),
     ):
         with pytest.raises(kind, match=message):
-            quantize_model(given, calibration)
-    for given, dtype, calibration in (
+            quantize_model(given, batches)
+    for given, dtype, batches in (
         (quantized, torch.float32, None),
         (model, torch.bfloat16, [seen]),
         (model, torch.int8, None),
         (quantized, torch.int8, [seen]),
     ):
         with pytest.raises(ValueError, match=r"quantized? model|quantize_model"):
-            optimize(given, dtype, calibration=calibration)
+            optimize(given, dtype, batches=batches)
 
 
 def may_overflow(weight):

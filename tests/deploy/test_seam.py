@@ -25,7 +25,8 @@ OPTIONS = {
     "grey backbone": dict(features_only=True, in_chans=1, mean=0.4, std=0.2),
     "distance": dict(task="distance"),
     "mercator": dict(view="mercator", size=(40, 30)),
-    "equirectangular": dict(view="equirectangular", fov=2.8),
+    "equirectangular": dict(view=dict(name="equirectangular", fov=2.8)),
+    "perspective": dict(view="perspective", task="distance"),
 }
 CASES = [
     *list_models(),
@@ -37,7 +38,7 @@ MORE = [
     *(f"{name} grey" for name in list_models() if name.endswith("nano")),
     *(f"{name} grey backbone" for name in ENCODERS if name.endswith("nano")),
     "darswin_unet_a_nano distance",
-    "swin_unet_undis_nano distance",
+    "swin_unet_nano perspective",
     "conv_unet_nano mercator",
     "swin_unet_nano equirectangular",
 ]

@@ -56,7 +56,9 @@ def record(path: str) -> dict:
 
 def draw_lens() -> Figure:
     sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
-    return plot.draw_lens(PICTURE, WIDE, sampler, make_view("tangent", (60, 80), fov=1.9), "a view")
+    return plot.draw_lens(
+        PICTURE, WIDE, sampler, make_view("perspective", (60, 80), fov=1.9), "a view"
+    )
 
 
 def draw_calibrated() -> Figure:

@@ -12,7 +12,6 @@ from darswin.lens import (
     KannalaBrandt,
     Mei,
     Perspective,
-    Polynomial,
     Spherical,
     distance_to_z,
     reproject,
@@ -20,7 +19,6 @@ from darswin.lens import (
 )
 from darswin.lens.pixels import (
     OUTSIDE,
-    perspective_view,
     pixel_angles,
     pixel_rays,
     ray_channels,
@@ -169,17 +167,6 @@ def test_reproject_of_many():
     torch.testing.assert_close(half.float(), together, rtol=0, atol=0.01)
     assert reproject(images[:0], source[:0], target, (16, 18)).shape == (0, 3, 16, 18)
     assert math.hypot(7.5, 8.5) > 8.0 and not together[..., 0, 0].any()  # beyond θ_max
-
-
-@pytest.mark.parametrize("size", [(64, 64), (40, 64), (64, 40)])
-def test_perspective_view(size):
-    papers = 2 * math.atan(64 / 3)  # 174.6°, of the paper's images
-    wide = Polynomial([20.0], math.radians(100)), math.radians(87.5)
-    for lens, theta_max in ((Spherical.from_fov(0.5, papers, 32.0), papers / 2), wide):
-        view = perspective_view(lens, size, math.radians(175))
-        torch.testing.assert_close(view.theta_max, torch.tensor([theta_max]))
-        torch.testing.assert_close(view.r_max, torch.tensor([min(size) / 2]), rtol=1e-4, atol=0)
-        assert view.center is None
 
 
 def test_a_ray_keeps_its_angles():

@@ -8,12 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers import slow_but
+from helpers import create, slow_but
 from launches import Launches, launches
 
 from darswin import lens
 from darswin.lens import cat, distorted, solve
-from darswin.models import create_model
 from darswin.train.classification import Classification
 from darswin.train.distance import Distance
 from darswin.train.segmentation import Segmentation
@@ -33,14 +32,14 @@ MODELS = {
     "darswin_ra_nano": dict(spacing="g", sample_spacing="radius"),
     "darswin_a_micro": dict(position_bias="polar", spacing="tan"),
     "swin_nano": dict(image_size=64),
-    "swin_undis_nano": dict(image_size=64),
+    "swin_nano perspective": dict(image_size=64),
     "dat_nano": dict(image_size=64),
     "darswin_unet_a_nano": dict(task="distance"),
-    "swin_unet_undis_nano": dict(task="distance", image_size=64),
+    "swin_unet_nano perspective": dict(task="distance", image_size=64),
     "conv_unet_nano": dict(task="distance", view="mercator", size=48),
-    "swin_unet_nano": dict(image_size=64, view="equirectangular", fov=2.6),
+    "swin_unet_nano": dict(image_size=64, view=dict(name="equirectangular", fov=2.6)),
 }
-VIEWS = ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
+VIEWS = ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_nano perspective")
 CALLS = [
     *((name, "spherical", torch.float32) for name in MODELS),
     *((name, "spherical", torch.uint8) for name in (*VIEWS, "swin_nano")),
@@ -50,7 +49,7 @@ CALLS = [
 
 
 def network(name, **options):
-    return create_model(name, **options).to("meta")
+    return create(name, **options).to("meta")
 
 
 def images(dtype=torch.float32, size=64):

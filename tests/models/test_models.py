@@ -22,6 +22,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.features import take_indices
 from darswin.models.registry import has_image_size, model_class
 from darswin.ops import use_reference
+from darswin.views import make_view
 
 NAMES = list_models()
 TRANSFORMERS = [name for name in NAMES if not issubclass(model_class(name), ConvUnet)]
@@ -29,19 +30,30 @@ ENCODERS = [name for name in NAMES if issubclass(model_class(name), Encoder)]
 NANOS = [name for name in NAMES if name.endswith("nano")]
 NANO_ENCODERS = [name for name in NANOS if name in ENCODERS]
 NANO_UNETS = [name for name in NANOS if name not in ENCODERS]
+WITH_VIEWS = ("swin_nano perspective", "swin_unet_nano perspective", "swin_unet_nano square")
 IGNORE_THE_LENS = ("swin_nano", "swin_unet_nano", "dat_nano")
-ONE_OF_EACH_KIND = ("darswin_a_nano", "swin_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
+ONE_OF_EACH_KIND = ("darswin_a_nano", "swin_nano", "darswin_unet_a_nano", WITH_VIEWS[1])
 CASES = {name: (name, {}) for name in NANOS} | {
-    f"{name} distance": (name, dict(task="distance"))
-    for name in ("darswin_unet_a_nano", "swin_unet_undis_nano")
+    case: (case.split()[0], dict(view=case.split()[1])) for case in WITH_VIEWS
 } | {
+    "darswin_unet_a_nano distance": ("darswin_unet_a_nano", dict(task="distance")),
+    "swin_unet_nano perspective distance": (
+        "swin_unet_nano",
+        dict(task="distance", view="perspective"),
+    ),
     "official": ("official", {}),
     "feature maps": ("darswin_ra_nano", dict(features_only=True, out_indices=(0, 2))),
-    "square view": ("swin_nano", dict(view="square", spacing="g")),
-    "conv_unet_nano mercator": ("conv_unet_nano", dict(view="mercator", size=[36, 28], fov=2.6)),
+    "square view": ("swin_nano", dict(view=dict(name="square", spacing="g"))),
+    "conv_unet_nano mercator": (
+        "conv_unet_nano",
+        dict(view=dict(name="mercator", size=[36, 28], fov=2.6)),
+    ),
     "swin_unet_nano equirectangular distance": (
         "swin_unet_nano",
-        dict(task="distance", view="equirectangular", size=[64, 96], window=[4, 6], fov=2.6),
+        dict(
+            task="distance", window=[4, 6],
+            view=dict(name="equirectangular", size=[64, 96], fov=2.6),
+        ),
     ),
 }  # fmt: skip
 cases = pytest.mark.parametrize("case", CASES)
@@ -414,17 +426,19 @@ WRONG = [
     ("swin_nano", dict(image_size=33), r"divide the view's .* = \(33, 33\), got 2"),
     ("swin_nano", dict(image_size=36), r"stage 1: window \(4, 4\) must divide the map, \(18,"),
     ("swin_nano", dict(image_size=24), r"stage 2: window \(4, 4\) must divide the map, \(6, 6"),
-    ("swin_undis_nano", dict(max_fov=0.0), r"max_fov must be in \(0, π\), got 0"),
-    ("swin_undis_nano", dict(max_fov=math.pi), r"max_fov must be in \(0, π\), got 3"),
+    ("swin_nano", dict(view=dict(name="perspective", fov=4)), r"fov must be in \(0, 3.14\] rad"),
+    ("swin_nano", dict(view=dict(fov=1.0)), "view must have a name, got {'fov': 1.0}"),
+    ("swin_nano", dict(view=make_view("mercator", 32), mean=0.4), "has its own mean: leave it out"),
+    ("conv_unet_nano", dict(view=make_view("mercator", 32), size=32), "has its own size: leave"),
+    ("swin_nano", dict(view=make_view("none", 64)), r"must have image_size = \(32, 32\), got"),
     ("dat_nano", dict(blocks=("L", "N", "D")), "blocks must be of the kinds 'L', 'S' and 'D'"),
     ("dat_nano", dict(blocks=("L", "", "D")), "blocks must be of the kinds"),
     ("dat_nano", dict(blocks=("L", "D")), "one entry for each stage, 3"),
     ("dat_nano", dict(groups=(1, 1, 3)), "groups must divide num_heads = 4, got 3"),
     ("dat_nano", dict(num_heads=(5, 5, 5)), "num_heads must divide"),
     ("swin_unet_nano", dict(image_size=66), r"divide the view's .* = \(66, 66\), got 4"),
-    ("swin_unet_adapted_nano", dict(spacing="r"), "spacing must be one of .*, got 'r'"),
-    ("swin_unet_adapted_nano", dict(image_size=(64, 128)), r"must be square, got \(64, 128\)"),
-    ("swin_unet_undis_nano", dict(max_fov=4), r"max_fov must be in \(0, π\), got 4"),
+    ("swin_unet_nano", dict(view=dict(name="square", spacing="r")), "spacing must be one of .*'r'"),
+    ("swin_unet_nano", dict(view="square", image_size=(64, 128)), r"be square, got \(64, 128\)"),
 ] + [
     (name, options, message)
     for name in ("darswin_unet_a_nano", "swin_unet_nano")
@@ -448,9 +462,12 @@ def test_wrong_options(name, options, message):
 
 
 def test_a_view_has_options_of_its_own():
-    for name, option in (("swin_nano", "max_fov"), ("swin_unet_undis_nano", "spacing")):
-        with pytest.raises(TypeError, match=option):
-            create_model(name, **{option: 1.0})
+    for name, options in (
+        ("swin_nano", dict(fov=1.0)),
+        ("swin_unet_nano", dict(view=dict(name="perspective", spacing="g"))),
+    ):
+        with pytest.raises(TypeError, match="got an unexpected keyword argument"):
+            create_model(name, **options)
 
 
 @torch.no_grad()
@@ -459,7 +476,7 @@ def test_a_view_has_options_of_its_own():
 def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
     model, side = network(name, in_chans=channels, mean=0.5, std=0.2), side_of(name)
     lenses = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
-    sizes = ((side, side), (20, 7 - channels), (1, 1))[: 1 if has_image_size(name) else 3]
+    sizes = ((side, side), (20, 7 - channels), (1, 1))[: 1 if model.image_size else 3]
     for size in sizes:
         planes = torch.randint(256, (2, channels, *size), dtype=torch.uint8)
         expected = model((planes / 255 - 0.5) / 0.2, lenses)
@@ -481,7 +498,6 @@ def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
 PARAMETERS = {
     "darswin_a_small": (48_977_864, 49_593_064),
     "swin_small": (48_953_762, 49_568_962),
-    "swin_undis_small": (48_953_762, 49_568_962),
     "dat_small": (49_006_434, 49_621_634),
 }
 
@@ -758,7 +774,7 @@ def test_one_graph_at_any_batch_size_with_the_same_results(name):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_graphs_before_or_after")
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano"])
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano perspective"])
 def test_a_compiled_training_step_with_the_default_backend(name):
     options = dict(jitter=0.0) if name.startswith("darswin") else {}
     # Compiling a single block takes seconds.

@@ -1,10 +1,14 @@
 import json
+import math
 
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from darswin.models.saving import ModelCard, load_model, read_card
+from darswin import create_model
+from darswin.lens import Equidistant
+from darswin.models.saving import ModelCard, load_model, read_card, save_model
+from darswin.views import MercatorView, make_view
 
 CARD = ModelCard(
     "darswin_a_nano", {"num_classes": 3, "in_chans": 1, "spacing": "tan"}, ["a", "b", "c"], 32, 2.9
@@ -100,3 +104,60 @@ def test_a_card_shows_the_normalization():
     assert str(card).endswith("mean=[0.4, 0.5, 0.6], std=0.2)")
     model = card.create()
     assert list(model.mean) == card.mean and set(model.std) == {card.std}
+
+
+def test_a_card_keeps_the_whole_view(tmp_path):
+    path, frame = tmp_path / "m.safetensors", torch.randint(256, (1, 3, 32, 32), dtype=torch.uint8)
+    view = make_view(
+        "mercator", (24, 32), fov=2.0, up=torch.tensor([0.2, -1, 0]), mean=0.4, std=0.2
+    )
+    for options in (dict(view=view, window=(3, 4)), dict(view="mercator", mean=0.4)):
+        model = create_model("swin_nano", num_classes=3, **options).eval()
+        card = ModelCard("swin_nano", dict(options, num_classes=3))
+        save_model(path, model.state_dict(), card)
+        loaded, read = load_model(path)
+        made = model.view.made
+        assert read.options["view"].items() <= json.loads(json.dumps(made)).items()
+        assert loaded.view.made == made and (read.mean, read.std) == (0.4, card.std)
+        assert torch.equal(*(net(frame, Equidistant(12.0, 1.3)) for net in (model, loaded)))
+    with pytest.raises(ValueError, match="keeps views of make_view, but only its class made Merc"):
+        ModelCard("swin_nano", dict(view=MercatorView((32, 32))))
+    with pytest.raises(ValueError, match="mean is an option of the model and of its view"):
+        ModelCard("swin_nano", dict(view=view, mean=0.5))
+
+
+CIRCLE = dict(name="perspective", reach=1.0, theta_max=1.0, reads=1)
+WHOLE = dict(CIRCLE, reach=math.radians(87.5), theta_max=math.radians(87.5))
+
+
+@pytest.mark.parametrize(("model", "options", "new", "view"), [
+    ("swin_undis_nano", {}, "swin_nano", WHOLE),
+    ("swin_undis_nano", dict(max_fov=2.0), "swin_nano", CIRCLE),
+    ("swin_nano", dict(view="perspective", max_fov=None), "swin_nano", WHOLE),
+    ("swin_nano", dict(view="tangent", fov=1.2), "swin_nano", dict(name="perspective", fov=1.2)),
+    ("swin_nano", dict(view="none"), "swin_nano", "none"),
+    ("dat_nano", dict(view="square", theta_max=1.2), "dat_nano", dict(name="square", fov=2.4)),
+    ("swin_unet_undis_nano", dict(task="distance"), "swin_unet_nano", WHOLE),
+    ("swin_unet_adapted_nano", dict(spacing="g"), "swin_unet_nano",
+     dict(name="square", spacing="g")),
+    ("conv_unet_nano", dict(view="mercator", size=[36, 28], fov=2.6), "conv_unet_nano",
+     dict(name="mercator", size=[36, 28], fov=2.6)),
+    ("darswin_unet_a_nano", dict(view="polar", spacing="g"), "darswin_unet_a_nano", "polar"),
+    ("swin_undis_nano", dict(max_fov="x"), "swin_nano", None),
+])  # fmt: skip
+def test_a_file_of_before_the_views_had_their_options_is_read_or_refused(
+    model, options, new, view, tmp_path
+):
+    path, keeps = tmp_path / "m.safetensors", dict(num_classes=3)
+    keeps |= {name: options[name] for name in ("task",) if name in options}
+    keeps |= dict(spacing="g") if view == "polar" else {}
+    made = create_model(new, **keeps, **({} if view in (None, "polar") else dict(view=view)))
+    entry = json.dumps(dict(model=model, options=keeps | options))
+    weights = {name: tensor.contiguous() for name, tensor in made.state_dict().items()}
+    save_file(weights, path, metadata={"darswin": entry})
+    if view is None:
+        assert "its options {" in refusal(path)
+        return
+    loaded, card = load_model(path)
+    assert (card.model, card.options.pop("view")) == (new, view) and card.options == keeps
+    assert loaded.view.made == made.view.made and type(loaded) is type(made)

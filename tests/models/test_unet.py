@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import network
+from helpers import create, network
 
 from darswin import PolarView, create_model
 from darswin.layers.transformer import PatchMerging
@@ -249,14 +249,18 @@ def test_older_files_name_the_view_of_darswin(name):
         ("darswin_a_micro", "darswin_unet_a_micro", {}),
         ("darswin_ra_nano", "darswin_unet_ra_nano", dict(NANO, rings=8, sectors=32)),
         ("swin_nano", "swin_unet_nano", dict(NANO, image_size=32, patch_size=2)),
-        ("swin_undis_nano", "swin_unet_undis_nano", dict(NANO, image_size=32, patch_size=2)),
+        (
+            "swin_nano perspective",
+            "swin_unet_nano perspective",
+            dict(NANO, image_size=32, patch_size=2),
+        ),
     ],
 )
 def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options):
-    trained = create_model(classifier, num_classes=4).eval()
+    trained = create(classifier, num_classes=4).eval()
     for parameter in trained.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
-    model = create_model(unet, num_classes=5, **options).eval()
+    model = create(unet, num_classes=5, **options).eval()
     x, lens = torch.randn(1, 3, 32, 32), Spherical.from_fov(0.5, 2.6, 16.0)
     maps = trained.forward_intermediates(x, lens, intermediates_only=True)
     trained.reset_classifier(0)

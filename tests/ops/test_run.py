@@ -28,7 +28,9 @@ def given(name="darswin_a_nano", **options):
     return [*inputs, *(x[None] for x in found.constants)], found.weights, found.words
 
 
-@pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano"])
+@pytest.mark.parametrize(
+    "name", ["darswin_a_nano", "darswin_unet_a_nano", "swin_unet_nano perspective"]
+)
 def test_wrong_programs_are_refused_or_run(name):
     inputs, weights, words = given(name)
     chance = torch.Generator().manual_seed(0)

@@ -150,7 +150,11 @@ def test_all_stages_frozen_train_the_head_alone(classifier):
     [
         (ModelCard("darswin_ra_nano"), 1, {"stages", "norm", "head"}),
         (ModelCard("swin_nano", {"image_size": 32}), 1, {"stages", "norm", "head"}),
-        (ModelCard("swin_undis_nano", {"image_size": 32}), 1, {"stages", "norm", "head"}),
+        (
+            ModelCard("swin_nano", {"image_size": 32, "view": "mercator"}),
+            1,
+            {"stages", "norm", "head"},
+        ),
         (ModelCard("dat_nano", {"image_size": 32}), 1, {"stages", "norm", "head"}),
         (ModelCard("darswin_unet_a_nano", SMALL), 3, {"decoder", "places", "segmentation_head"}),
     ],
@@ -206,8 +210,7 @@ def test_options_that_disagree_are_named(card, task, model, data, message):
 
 
 def test_which_model_starts_from_which():
-    classifiers = {"darswin_ra_tiny": "darswin_unet_ra_tiny", "swin_micro": "swin_unet_micro",
-                   "swin_undis_nano": "swin_unet_undis_nano"}  # fmt: skip
+    classifiers = {"darswin_ra_tiny": "darswin_unet_ra_tiny", "swin_micro": "swin_unet_micro"}
     for name, dense in classifiers.items():
         assert name_from(ModelCard(name), "distance") == dense
         assert name_from(ModelCard(dense, task="distance"), "segmentation") == dense

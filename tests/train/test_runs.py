@@ -100,13 +100,15 @@ def test_with_lightnings_device_a_gpu_all_is_the_same(options, tmp_path, monkeyp
     [
         ("digits", "darswin_ra_nano"),
         pytest.param("digits", "dat_nano", marks=pytest.mark.slow),
-        ("frames", "swin_undis_nano"),
+        ("frames", "swin_nano perspective"),
         pytest.param("labels", "swin_unet_nano", marks=pytest.mark.slow),
-        ("labels", "swin_unet_adapted_nano"),
+        ("labels", "swin_unet_nano square"),
     ],
 )
 def test_models_train_and_test(options, tmp_path, data, name):
-    own = "{embed_dim: 8, depths: [1, 1, 1]}" if data == "labels" else "{}"
+    name, _, view = name.partition(" ")
+    own = dict(embed_dim=8, depths=[1, 1, 1]) if data == "labels" else {}
+    own = json.dumps(own | (dict(view=view) if view else {}))
     few = ["--trainer.max_steps", "2", "--trainer.accumulate_grad_batches", "1"]
     few += ["--model.name", name, "--model.options", own]
     fit(tmp_path / "run", *options[data], *few)

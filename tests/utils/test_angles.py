@@ -22,7 +22,6 @@ from darswin.lens import (
     from_dict,
 )
 from darswin.lens.orientation import rotated
-from darswin.models import LensAdapter
 from darswin.utils.angles import check_turn, degrees_hint
 from darswin.views import make_view, turned
 
@@ -46,7 +45,7 @@ RNG = np.random.default_rng(0)
         (lambda: FieldOfView(57, 100), "omega", 57),
         (lambda: Tabulated([0.0, 45.0, 90.0], [0.0, 100.0, 190.0]), "angles", 90),
         (lambda: rotated(Equidistant(100, center=(5, 5)), -90), "angle", -90),
-        (lambda: make_view("tangent", SIZE, fov=90), "fov", 90),
+        (lambda: make_view("perspective", SIZE, fov=90), "fov", 90),
         (lambda: make_view("cylindrical", SIZE, fov=180), "fov", 180),
         (lambda: make_view("equirectangular", SIZE, fov=360), "fov", 360),
         (lambda: make_view("mercator", SIZE, theta_max=85), "theta_max", 85),
@@ -57,10 +56,9 @@ RNG = np.random.default_rng(0)
         (lambda: PolynomialLenses().draw(RNG, 170, 32), "fov", 170),
         (lambda: WideAngle(None, SphericalLenses(0, 1), fov=170), "fov", 170),
         (lambda: PolarView(4, 8, (2, 2), theta_max=85), "theta_max", 85),
-        (lambda: LensAdapter(torch.nn.Identity(), 32, theta_max=85), "theta_max", 85),
+        (lambda: make_view("square", 32, fov=85), "fov", 85),
         (lambda: create_model("darswin_a_nano", theta_max=85), "theta_max", 85),
-        (lambda: create_model("swin_unet_adapted_nano", theta_max=85), "theta_max", 85),
-        (lambda: create_model("swin_unet_undis_nano", max_fov=170), "max_fov", 170),
+        (lambda: make_view("perspective", 32, reach=80), "reach", 80),
     ],
 )
 def test_an_angle_in_degrees_is_named_and_converted(make, name, degrees):

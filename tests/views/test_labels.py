@@ -77,7 +77,7 @@ def test_labels_of_every_form_go_through_every_lens_and_view(name):
     checked, boxes = set(), []
     view_size = {"none": SIZE, "panorama": (150, 420)}.get(name, (180, 180))
     for model, (lens, middle, in_picture) in pictures().items():
-        view = make_view(name, view_size, max_fov=2.0 if name == "perspective" else None)
+        view = make_view(name, view_size, fov=2.0 if name == "perspective" else None)
         assert is_whole(in_picture)
         for tile in range(view.count):
             of_tile = dict(tile=tile) if view.count > 1 else {}
@@ -105,7 +105,7 @@ def test_labels_of_every_form_go_through_every_lens_and_view(name):
     assert np.mean(boxes) > (0.8 if name == "square" else 0.9)
 
 
-@pytest.mark.parametrize("name", ["mercator", "cylindrical", "tangent"])
+@pytest.mark.parametrize("name", ["mercator", "cylindrical", "perspective"])
 def test_points_of_views_are_those_of_opencv(name):
     """OpenCV projects the same directions, into the view and into the picture."""
     camera = np.array([[150.0, 0, 322], [0, 150, 238], [0, 0, 1]])
@@ -121,8 +121,8 @@ def test_points_of_views_are_those_of_opencv(name):
         (brown, cv2.projectPoints(rays, nothing, nothing, camera, np.array(radial + tangential))),
     )
     fov, side = 1.4, 201
-    step = (2 * math.tan(fov / 2) if name == "tangent" else fov) / side
-    warper = cv2.PyRotationWarper("plane" if name == "tangent" else name, 1.0)
+    step = (2 * math.tan(fov / 2) if name == "perspective" else fov) / side
+    warper = cv2.PyRotationWarper("plane" if name == "perspective" else name, 1.0)
     eye = np.eye(3, dtype=np.float32)
     flat = np.array([warper.warpPoint(tuple(place), eye, eye) for place in places.tolist()])
     view, size = make_view(name, (side, side), fov=fov), (480, 640)

@@ -29,11 +29,11 @@ VIEWS = {
     "equirectangular around": ((20, 60), dict(fov=math.tau, **DOWN), True),
     "not quite around": ((20, 60), dict(fov=math.tau - 0.4, **DOWN), False),
     "stereographic": ((24, 24), dict(fov=1.5), False),
-    "tangent": ((24, 32), dict(fov=1.0), False),
-    "perspective": ((24, 32), dict(max_fov=1.5), False),
+    "perspective": ((24, 32), dict(fov=1.0), False),
+    "as far as the lens": ((24, 32), dict(reach=0.75, theta_max=0.75), False),
     "square": ((24, 24), {}, False),
 }
-NAMES = {"not quite around": "mercator"}
+NAMES = {"not quite around": "mercator", "as far as the lens": "perspective"}
 SCALES = (1.0, 0.5, 0.25, 2.0)
 
 
@@ -44,7 +44,7 @@ def view_of(key):
 
 def place_in(key, x, y):
     """The point of a view that a pixel of the image shows, or None: formulas alone, in float64."""
-    (height, width), options, around = VIEWS[key]
+    (height, width), options, _ = VIEWS[key]
     across, down = (x - CENTER[0]) / FOCAL, (y - CENTER[1]) / FOCAL
     theta, azimuth = math.hypot(across, down), math.atan2(down, across)
     if theta > 1.45:
@@ -61,18 +61,18 @@ def place_in(key, x, y):
     name = NAMES.get(key, key.removesuffix(" around"))
     if "up" in options:  # its picture's top is forward on the horizon
         ray = [ray[0], ray[2], -ray[1]]
-    fov = options.get("fov", math.tau if around else options.get("max_fov"))
-    if name == "perspective":
-        if theta > fov / 2:
-            return None
-        step = math.tan(fov / 2) / (min(height, width) / 2)
-    elif name == "tangent":
+    fov = options.get("fov", math.tau)
+    if theta > options.get("theta_max", math.pi):
+        return None
+    if "reach" in options:
+        step = math.tan(options["reach"]) / (min(height, width) / 2)
+    elif name == "perspective":
         step = math.tan(fov / 2) / (width / 2)
     elif name == "stereographic":
         step = 2 * math.tan(fov / 4) / (width / 2)
     else:
         step = fov / width
-    if name in ("perspective", "tangent"):
+    if name == "perspective":
         if ray[2] <= 0:
             return None
         u, v = ray[0] / ray[2], ray[1] / ray[2]
@@ -147,7 +147,7 @@ def test_a_map_comes_back_as_loops_compute_it(key):
 @pytest.mark.parametrize("name", [name for name in list_views() if name != "none"])
 @pytest.mark.parametrize("options", [{}, DOWN], ids=["ahead", "down"])
 def test_a_constant_comes_back_whole_and_ids_stay_ids(name, options):
-    if options and name in ("perspective", "square", "polar"):
+    if options and name in ("square", "polar"):
         options = {}
     view = make_view(name, (24, 24), **options)
     prepared = view.prepare(LENS, SIZE)
@@ -197,7 +197,7 @@ def model_of(name, view, task):
         return LensAdapter(nn.Conv2d(3, 4, 4, stride=4), 32, view=view, mean=0.0, std=1.0).eval()
     options = dict(task=task, num_classes=4, mean=0.0, std=1.0)
     if name != "darswin_unet_a_nano":
-        options |= dict(view=view, size=(32, 32))
+        options |= dict(view=dict(name=view, size=32))
     else:
         options |= dict(theta_max=1.1)
     if name == "swin_unet_nano":

@@ -20,7 +20,7 @@ from darswin.lens import (
 from darswin.lens.concentric import square_to_disc
 from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
-from darswin.views import PlainView
+from darswin.views import PlainView, make_view
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
 GENERAL = KannalaBrandt(
@@ -59,7 +59,8 @@ def smooth(height, width):
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_what_is_taken_to_the_square_comes_back(lens, spacing):
     images = smooth(48, 52).expand(2, -1, -1, -1)
-    out = LensAdapter(nn.Identity(), 192, spacing)(images, lens)
+    view = make_view("square", 192, spacing=spacing)
+    out = LensAdapter(nn.Identity(), view=view)(images, lens)
     theta, _ = lens.unproject_pixels(torch.stack(pixels(48, 52), -1)[None], (48, 52))
     seen = lens.sees(theta).expand(2, -1, -1)[:, None].expand_as(out)
     inner = (theta < 0.9 * lens.theta_max[:, None, None]).expand(2, -1, -1)[:, None]
@@ -68,11 +69,11 @@ def test_what_is_taken_to_the_square_comes_back(lens, spacing):
     inner = (inner & inside).expand_as(out)
     assert (out[~seen] == 0).all() and inner.float().mean() > 0.3
     assert (out - images).abs()[inner].max() < 0.02
-    coarse = LensAdapter(nn.AvgPool2d(4), 192, spacing)(images, lens)
+    coarse = LensAdapter(nn.AvgPool2d(4), view=view)(images, lens)
     assert coarse.shape == images.shape and (coarse - images).abs()[inner].mean() < 0.02
 
 
-def test_a_fixed_theta_max_gives_things_one_size_in_the_square():
+def test_a_field_of_view_gives_things_one_size_in_the_square():
     edge, seen = 1.2, []
 
     class Network(nn.Module):
@@ -80,9 +81,9 @@ def test_a_fixed_theta_max_gives_things_one_size_in_the_square():
             seen.append(x)
             return x
 
-    wide = Equidistant(40.0, 1.5)
+    wide, square = Equidistant(40.0, 1.5), make_view("square", 32, fov=2 * edge)
     for lens in (wide, wide.with_theta_max(0.8)):
-        adapter, images = LensAdapter(Network(), 32, theta_max=edge), 2 + smooth(130, 130)
+        adapter, images = LensAdapter(Network(), view=square), 2 + smooth(130, 130)
         out = adapter(images, lens)
         theta, _ = lens.unproject_pixels(torch.stack(pixels(130, 130), -1)[None], (130, 130))
         inside = (theta <= min(edge, lens.theta_max.item()))[:, None].expand_as(out)
@@ -92,7 +93,8 @@ def test_a_fixed_theta_max_gives_things_one_size_in_the_square():
     torch.testing.assert_close(both[0][common], both[1][common])
     # A lens with θ_max at the edge sees the same without a fixed angle.
     lens = wide.with_theta_max(edge)
-    same = (LensAdapter(nn.Identity(), 32, theta_max=end)(images, lens) for end in (None, edge))
+    views = (make_view("square", 32), square)
+    same = (LensAdapter(nn.Identity(), view=view)(images, lens) for view in views)
     torch.testing.assert_close(*same, atol=1e-4, rtol=1e-4)
 
 
@@ -117,7 +119,7 @@ def test_with_a_fixed_theta_max_a_wider_lens_sees_the_same_and_more(name):
 def test_a_lens_in_float32_sees_as_much_as_in_float64():
     focal = torch.tensor([40.0], dtype=torch.float64)
     exact = BrownConrady(focal, [-0.22, 0.13, 0.028], tangential=[1e-3, 1e-3], center=[25.0, 24.0])
-    adapter, images = LensAdapter(nn.Identity(), 192), 2 + smooth(48, 52)
+    adapter, images = LensAdapter(nn.Identity(), 192, view="square"), 2 + smooth(48, 52)
     for lens in (exact, exact.to(torch.float32)):
         out = adapter(images, lens)[..., 2:-2, 2:-2]
         assert (out - images[..., 2:-2, 2:-2]).abs().max() < 0.2
@@ -125,7 +127,7 @@ def test_a_lens_in_float32_sees_as_much_as_in_float64():
 
 def test_outputs_of_any_resolution_come_back_and_others_pass_through():
     network = Network().eval()
-    adapter, images = LensAdapter(network, 32), torch.randn(2, 3, 48, 40)
+    adapter, images = LensAdapter(network, 32, view="square"), torch.randn(2, 3, 48, 40)
     prepared = adapter.prepare(LENSES, (48, 40))
     out = adapter.run(images, prepared)
     assert [m.shape for m in out["masks"]] == [(2, 5, 48, 40), (2, 6, 48, 40)]
@@ -142,7 +144,8 @@ def test_outputs_of_any_resolution_come_back_and_others_pass_through():
 
 @pytest.mark.parametrize("general", [False, True])
 def test_it_trains_end_to_end_with_its_lens(general):
-    adapter, images = LensAdapter(Network(), 32), torch.randn(2, 3, 48, 48, requires_grad=True)
+    adapter = LensAdapter(Network(), 32, view="square")
+    images = torch.randn(2, 3, 48, 48, requires_grad=True)
     focal = torch.tensor([14.0], requires_grad=True)
     center = torch.tensor([[22.0, 27.0]], requires_grad=True)
     tangential = dict(tangential=[[0.02, 0.01]]) if general else {}
@@ -155,24 +158,25 @@ def test_it_trains_end_to_end_with_its_lens(general):
 
 def test_double_precision_and_half():
     lens, images = LENSES.to(torch.float64), torch.rand(2, 3, 40, 40)
-    exact = LensAdapter(nn.Identity(), 64)(images.double(), lens)
+    exact = LensAdapter(nn.Identity(), 64, view="square")(images.double(), lens)
     assert exact.dtype == torch.float64
-    rounded = LensAdapter(nn.Identity(), 64)(images, LENSES)
+    rounded = LensAdapter(nn.Identity(), 64, view="square")(images, LENSES)
     torch.testing.assert_close(rounded.double(), exact, atol=1e-3, rtol=0)
-    half = LensAdapter(nn.Identity(), 64)(images.bfloat16(), LENSES)
+    half = LensAdapter(nn.Identity(), 64, view="square")(images.bfloat16(), LENSES)
     assert half.dtype == torch.bfloat16 and (half - rounded).abs().max() < 0.02
 
 
 def test_wrong_arguments_of_an_adapter():
-    for size in (0, -1, 2.5, "8"):
-        with pytest.raises(ValueError, match=r"size must be an int of at least 1, or .*, got"):
+    for size, error in ((0, ValueError), (-1, ValueError), (2.5, TypeError), ("8", TypeError)):
+        with pytest.raises(error, match=r"size must be (at least 1|a pair of ints).*, got"):
             LensAdapter(nn.Identity(), size)
-    with pytest.raises(ValueError, match=r"spacing must be one of .*, got 'r'"):
-        LensAdapter(nn.Identity(), 8, "r")
-    with pytest.raises(ValueError, match=r"theta_max must be in \(0, π\), got 4"):
-        LensAdapter(nn.Identity(), 8, theta_max=4)
-    with pytest.raises(ValueError, match="needs spacing='theta', got 'g'"):
-        LensAdapter(nn.Identity(), 8, "g", theta_max=1.0)
+    for options, message in (
+        (dict(spacing="r"), r"spacing must be one of .*, got 'r'"),
+        (dict(fov=7), r"fov must be in \(0, 2π\] rad, got 7"),
+        (dict(spacing="g", fov=2.0), "needs spacing='theta', got 'g'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_view("square", 8, **options)
     adapter, images = LensAdapter(nn.Identity(), 8), torch.zeros(3, 3, 40, 40)
     with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
         adapter(images, None)
@@ -183,7 +187,7 @@ def test_wrong_arguments_of_an_adapter():
     with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(20, 20\)"):
         adapter(images, LENSES.replace(image_size=torch.tensor([[20.0, 20.0]] * 2)))
     with pytest.raises(ValueError, match="spacing='tan' needs lenses"):
-        LensAdapter(nn.Identity(), 8, "tan")(images, Equidistant(9.0, 1.7))
+        make_view("square", 8, spacing="tan")(images, Equidistant(9.0, 1.7))
 
 
 # -- perspective views ----------------------------------------------------------------------------
@@ -199,7 +203,8 @@ def scene(size):
 def undistorted(picture, lens, **options):
     """The images that a model gives to its first layer."""
     side, seen = picture.shape[2], []
-    model = create_model("swin_undis_nano", in_chans=1, image_size=side, **options).eval()
+    view = make_view("perspective", side, **options)
+    model = create_model("swin_nano", in_chans=1, image_size=side, view=view).eval()
     model.patch_embed.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     model(picture, lens)
     return seen[0]
@@ -212,7 +217,7 @@ def test_the_perspective_image_comes_back(xi):
     picture = scene(side)
     lens = Spherical.from_fov(xi, fov, side / 2)
     distorted = reproject(picture, perspective, lens, (side, side))
-    back = undistorted(distorted, lens)
+    back = undistorted(distorted, lens, reach=fov / 2, theta_max=fov / 2)
     radius = torch.hypot(*(t - (side - 1) / 2 for t in pixels(side, side)))
     inside = radius <= side / 2 - 2
     error = (back - picture)[0, 0][inside].abs().max()
@@ -222,21 +227,23 @@ def test_the_perspective_image_comes_back(xi):
     assert not back[0, 0][radius > side / 2 + 1].any()
 
 
-def test_a_view_keeps_the_lenss_field_of_view_up_to_the_limit():
+def test_a_view_reaches_as_far_as_the_lens_up_to_its_limit():
     side, wide = 64, Polynomial([20.0], math.radians(95))
     picture = scene(side)
-    limited = undistorted(picture, wide, max_fov=math.radians(100))
+    end = dict(theta_max=math.radians(50), reads=1)
+    limited = undistorted(picture, wide, reach=math.radians(50), **end)
     narrow = Polynomial([20.0], math.radians(50))
     expected = reproject(
         picture, narrow, Perspective.from_fov(math.radians(100), side / 2), (side, side)
     )
     torch.testing.assert_close(limited, expected, rtol=0, atol=1e-5)
-    assert (undistorted(picture, wide) - limited).abs().max() > 0.1  # the default is 175°
+    of_narrow = undistorted(picture, narrow, reach=math.radians(80), **end)
+    torch.testing.assert_close(of_narrow, expected, rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_the_lens_through_the_view():
     xi = torch.tensor([0.4], requires_grad=True)
-    model = create_model("swin_undis_nano")
+    model = create_model("swin_nano", view=make_view("perspective", 32, reach=1.4))
     model(torch.randn(2, 3, 32, 32), Spherical(xi, 12.0, 1.0)).square().sum().backward()
     assert xi.grad.isfinite().all() and xi.grad.all()
 
@@ -264,7 +271,8 @@ def test_a_map_coarser_than_the_image_is_resized():
 
 @torch.no_grad()
 def test_undistorted_it_predicts_in_the_view_and_brings_back():
-    undis = network("swin_unet_undis_nano", max_fov=2.0)
+    seen = dict(name="perspective", reach=1.0, theta_max=1.0)
+    undis = network("swin_unet_nano", view=seen)
     plain = of_the_same_weights(undis, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     half = torch.full((2,), 1.0)  # the view shows 2.0 rad of the 2.6 rad
@@ -283,11 +291,12 @@ def test_undistorted_it_predicts_in_the_view_and_brings_back():
 @torch.no_grad()
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_adapted_it_is_a_lens_adapter_around_it(spacing):
-    adapted = network("swin_unet_adapted_nano", spacing=spacing)
+    adapted = network("swin_unet_nano", view=dict(name="square", spacing=spacing))
     plain = of_the_same_weights(adapted, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     got = adapted(images, WIDE)
-    assert torch.equal(got, LensAdapter(plain, 64, spacing)(images, WIDE))
+    view = make_view("square", 64, spacing=spacing)
+    assert torch.equal(got, LensAdapter(plain, view=view)(images, WIDE))
     assert (got[:, :, 0, 0] == 0).all() and (got[:, :, 32, 1] != 0).all()
 
 
@@ -317,9 +326,13 @@ def rays_of_the_fixed_square(lens, size):
     ("name", "options", "rays_of"),
     [
         ("darswin_unet_a_nano", {}, rays_of_the_image),
-        ("swin_unet_undis_nano", {}, rays_of_the_perspective_view),
-        ("swin_unet_adapted_nano", {}, rays_of_the_square),
-        ("swin_unet_adapted_nano", dict(theta_max=1.5), rays_of_the_fixed_square),
+        (
+            "swin_unet_nano",
+            dict(view=dict(name="perspective", reach=1.5)),
+            rays_of_the_perspective_view,
+        ),
+        ("swin_unet_nano square", {}, rays_of_the_square),
+        ("swin_unet_nano", dict(view=dict(name="square", fov=3.0)), rays_of_the_fixed_square),
     ],
 )
 def test_the_head_reads_the_rays_of_its_pixels(name, options, rays_of):

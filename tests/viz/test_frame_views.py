@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from darswin.viz.views import undistort
 from frame_samples import MEAN, ROUND, STD, bilinear, random_frame
 from lens_examples import FRONT
 
@@ -14,14 +15,13 @@ from darswin import frames
 from darswin.deploy import camera
 from darswin.lens import Equidistant
 from darswin.views import SquareView, make_view, turned
-from darswin.viz.views import undistort
 
 VIEWS = {
-    "all inside": make_view("tangent", (40, 50), fov=1.4),
+    "all inside": make_view("perspective", (40, 50), fov=1.4),
     "beyond": make_view("equirectangular", (30, 60), fov=2 * math.pi, reads=1),
     "turned": make_view("cylindrical", (30, 60), fov=2.0, **turned(0.7, -0.4)),
     "shrunk": make_view("mercator", (12, 20), fov=3.0, up=(0.3, -1, 0.2), reads=3),
-    "square": SquareView((30, 30), theta_max=1.3),
+    "square": SquareView((30, 30), fov=2.6),
 }
 
 
@@ -48,7 +48,7 @@ def test_plans_of_views_are_exact_pictures(name, channels):
 @pytest.mark.parametrize(
     "view",
     [
-        make_view("tangent", (60, 80), fov=1.5, **turned(0.2)),
+        make_view("perspective", (60, 80), fov=1.5, **turned(0.2)),
         make_view("stereographic", (20, 30), fov=2.5, reads=3),
         make_view("mercator", (17, 25), reads=2),
     ],
@@ -70,7 +70,7 @@ def test_places_are_exact_for_lenses_in_single_precision_too(view):
 
 
 def test_views_can_become_normalized_images_for_any_network():
-    frame, view = random_frame(64, 64, 3), make_view("tangent", (20, 30), fov=1.0)
+    frame, view = random_frame(64, 64, 3), make_view("perspective", (20, 30), fov=1.0)
     plan = camera.plan(view, ROUND, (64, 64), mean=MEAN, std=STD)
     picture = frames.Sampler(replace(plan, output="uint8"))(frame)
     found = frames.Sampler(plan)(frame)

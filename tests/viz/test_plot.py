@@ -116,7 +116,7 @@ def test_it_is_hatched_where_there_is_no_picture():
 def test_ticks_of_a_view_are_angles_from_its_middle(options, fov):
     lens, image = Polynomial([20.0, 1.0, 0.5], 1.7), np.zeros((48, 80), np.uint8)
     for name, place in (
-        ("tangent", lambda angle: 20 / math.tan(fov / 2) * np.tan(angle)),
+        ("perspective", lambda angle: 20 / math.tan(fov / 2) * np.tan(angle)),
         ("equirectangular", lambda angle: 40 / fov * angle),
         ("stereographic", lambda angle: 20 / math.tan(fov / 4) * np.tan(angle / 2)),
     ):
@@ -131,7 +131,7 @@ def test_ticks_of_a_view_are_angles_from_its_middle(options, fov):
 
 def test_ticks_of_the_square_and_of_views_without_any():
     lens, image = Polynomial([20.0, 1.0, 0.5], 1.7), np.zeros((48, 80), np.uint8)
-    (axes,) = drawn(draw_view, image, lens, SquareView((41, 41), theta_max=1.2))
+    (axes,) = drawn(draw_view, image, lens, SquareView((41, 41), fov=2.4))
     shown = [float(text.get_text()[:-1]) for text in axes.xaxis.get_ticklabels()]
     expected = 20 + 20.5 * np.radians(shown) / 1.2
     np.testing.assert_allclose(axes.xaxis.get_ticklocs(), expected, atol=0.05)
@@ -165,7 +165,7 @@ def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
 def test_draw_lens_has_all_panels(tmp_path):
     image = np.zeros((48, 64, 3), np.uint8)
     lens = KannalaBrandt(20.0, [0.01], 1.7)
-    figure = draw_lens(image, lens, SAMPLER, make_view("tangent", (6, 8), fov=1.0), "ahead")
+    figure = draw_lens(image, lens, SAMPLER, make_view("perspective", (6, 8), fov=1.0), "ahead")
     assert len(figure.axes) == 6  # five panels, and the second scale of the curve
     heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
              "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip

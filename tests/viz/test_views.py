@@ -5,21 +5,21 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from darswin.viz.views import undistort, view_map
 from lens_examples import FRONT
 from scipy.spatial.transform import Rotation
 
 from darswin.lens import KannalaBrandt, Mei, Perspective
 from darswin.lens.pixels import OUTSIDE
 from darswin.views import PlainView, PolarView, SquareView, make_view, turned
-from darswin.viz.views import undistort, view_map
 
 
 def by_hand(name, size, fov, yaw=0.0, pitch=0.0):
     """The rays of the pixels of a view, unit vectors (H, W, 3), by formulas; NaN beyond a pole."""
-    step = 2 * math.tan(fov / 2) / size[1] if name == "tangent" else fov / size[1]
+    step = 2 * math.tan(fov / 2) / size[1] if name == "perspective" else fov / size[1]
     v, u = np.indices(size)
     x, y = (u - (size[1] - 1) / 2) * step, (v - (size[0] - 1) / 2) * step
-    if name == "tangent":
+    if name == "perspective":
         rays = np.stack((x, y, np.ones_like(x)), -1)
     elif name == "cylindrical":
         rays = np.stack((np.sin(x), y, np.cos(x)), -1)
@@ -32,8 +32,8 @@ def by_hand(name, size, fov, yaw=0.0, pitch=0.0):
 
 # Their names, sizes, fields of view, yaw and pitch.
 VIEWS = {
-    "tangent": ("tangent", (60, 80), math.radians(100)),
-    "aside": ("tangent", (60, 80), math.radians(70), 0.8, -0.3),
+    "perspective": ("perspective", (60, 80), math.radians(100)),
+    "aside": ("perspective", (60, 80), math.radians(70), 0.8, -0.3),
     "cylindrical": ("cylindrical", (60, 160), math.radians(180)),
     "equirectangular": ("equirectangular", (90, 180), 2 * math.pi),
 }
@@ -116,19 +116,19 @@ def test_behind_the_camera_is_black():
     around = undistort(image, lens, made("equirectangular", (91, 181), 2 * math.pi))
     assert around[45, 90] == 1 and not around[:, :20].any() and not around[:, -20:].any()
     with pytest.raises(ValueError, match="this view sees nothing of the lens"):
-        undistort(image, lens, made("tangent", (20, 20), 1.0, math.pi))
+        undistort(image, lens, made("perspective", (20, 20), 1.0, math.pi))
 
 
 TURNS = ((0.0, 0.0), (0.4, -0.2), (1.2, 0.3), (math.pi, 0.1), (-math.pi, -0.4),
          (0.0, math.pi / 2), (0.7, -math.pi / 2), (2 * math.pi, 2.5))  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["tangent", "cylindrical", "equirectangular"])
+@pytest.mark.parametrize("name", ["perspective", "cylindrical", "equirectangular"])
 @pytest.mark.parametrize("turn", TURNS)
 def test_rays_are_those_of_formulas_and_turn(name, turn):
     """Fields of view are between the outer edges of pixels; yaw looks right, and pitch up."""
     for size, fov in (((4, 6), 1.4), ((9, 8), 3.0), ((9, 8), 2 * math.pi)):
-        if name == "tangent" and fov > 3:
+        if name == "perspective" and fov > 3:
             continue
         grid = torch.from_numpy(np.stack(np.indices(size)[::-1], -1)).double()
         rays = made(name, size, fov, *turn).to_rays(grid[None], front(), (966, 1280))[0]
@@ -142,14 +142,16 @@ def test_rays_are_those_of_formulas_and_turn(name, turn):
 def test_a_view_that_shrinks_is_the_mean_of_areas():
     """As more points have it, and OpenCV's reduction of a flat picture."""
     lens, noise = front(), np.random.default_rng(0).random((966, 1280)).astype(np.float32)
-    described = ("tangent", (30, 40), 1.5)
+    described = ("perspective", (30, 40), 1.5)
     fine = undistort(noise, lens, made(described[0], (30 * 16, 40 * 16), 1.5, reads=1))
     means = fine.reshape(30, 16, 40, 16).mean((1, 3))
     single = np.abs(undistort(noise, lens, made(*described, reads=1)) - means).mean()
     assert np.abs(undistort(noise, lens, made(*described)) - means).mean() < single / 3
     flat = Perspective(60.0, 1.2, image_size=(60, 80))
     picture = (noise[:60, :80] * 255).astype(np.uint8)
-    reduced = undistort(picture, flat, made("tangent", (30, 40), 2 * math.atan(40 / 60), reads=2))
+    reduced = undistort(
+        picture, flat, made("perspective", (30, 40), 2 * math.atan(40 / 60), reads=2)
+    )
     expected = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA)
     assert reduced.dtype == np.uint8 and np.abs(reduced.astype(int) - expected).max() <= 1
 
@@ -157,11 +159,11 @@ def test_a_view_that_shrinks_is_the_mean_of_areas():
 def test_colours_and_types():
     lens = front()
     image = np.random.default_rng(0).integers(256, size=(966, 1280, 3), dtype=np.uint8)
-    view = undistort(image, lens, made(*VIEWS["tangent"]))
+    view = undistort(image, lens, made(*VIEWS["perspective"]))
     assert view.shape == (60, 80, 3) and view.dtype == np.uint8
     small = Perspective(10.0, 1.2)  # no principal point of its own: that of the image
     picture = np.arange(35, dtype=np.float32).reshape(5, 7)
-    same = undistort(picture, small, made("tangent", (5, 7), 2 * math.atan(0.35)))
+    same = undistort(picture, small, made("perspective", (5, 7), 2 * math.atan(0.35)))
     np.testing.assert_allclose(same, picture, atol=1e-3)
 
 
@@ -172,14 +174,14 @@ def test_tiles_and_squares():
     assert shown.shape == (4 * 32, 40, 3)
     for k, tile in enumerate(tiles.tiles):
         np.testing.assert_array_equal(shown[k * 32 : k * 32 + 32], undistort(image, lens, tile))
-    square = SquareView((50, 50), theta_max=1.5)
+    square = SquareView((50, 50), fov=3.0)
     seen = square(torch.from_numpy(image)[None].movedim(-1, 1).double(), lens)[0]
     found = undistort(image, lens, square)
     np.testing.assert_allclose(found, seen.movedim(0, -1), atol=0.05)
 
 
 def test_errors():
-    view = make_view("tangent", (4, 4), fov=1.0)
+    view = make_view("perspective", (4, 4), fov=1.0)
     with pytest.raises(ValueError, match="one lens, got 2"):
         view_map(Perspective([10.0, 20.0], 1.0), view, (4, 4))
     with pytest.raises(ValueError, match="lens belongs to images of"):

@@ -1,4 +1,4 @@
-"""A calibration: a lens, and how sure it is."""
+"""A calibrated lens: a lens, and how sure it is."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ from darswin.utils.arrays import as_tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration:
+class CalibratedLens:
     """A lens found from P pictures of a board with K corners, and how sure it is.
 
     Attributes:
@@ -71,11 +71,11 @@ class Calibration:
         lens = self.lens.with_theta_max(None)
         rays, count = lens.unproject_points(pixels.reshape(-1, 2)), len(self._vector)
 
-        def places(numbers: Tensor) -> Tensor:
+        def points(numbers: Tensor) -> Tensor:
             turned = torch.linalg.cross(*torch.broadcast_tensors(numbers[:, None, count:], rays))
             return self._free.at(numbers[:, :count], lens.theta_max).project_points(rays + turned)
 
-        slopes = slopes_of(places, torch.cat((self._vector, torch.zeros(3).to(rays))))
+        slopes = slopes_of(points, torch.cat((self._vector, torch.zeros(3).to(rays))))
         (a, b), (_, d) = ((slopes @ self._joint @ slopes.mT)[:, k].unbind(1) for k in (0, 1))
         spread = (a + d) / 2 + torch.hypot(b, (a - d) / 2)
         return spread.sqrt().reshape(pixels.shape[:-1])
