@@ -27,12 +27,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from darswin import create_model, lens
-from darswin.data import LEVELS, warp_map
-from darswin.data.warping import remap
+from darswin.data import LEVELS
 from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file
-from darswin.views import PolarView
+from darswin.views import CameraView, PolarView
 from darswin.viz.plot import TEXT, draw_accuracy, draw_grid, page_figure, save_figure
 
 FOV = math.radians(165)
@@ -52,9 +51,11 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
     camera = lens.Perspective.from_fov(FOV, scans.shape[2] / 2)
     # The field of view fills the inscribed circle of the image for every ξ.
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, size / 2)
-    maps = warp_map(camera, scans.shape[1:], lenses, (size, size))
+    view = CameraView(lenses, (size, size), reads=1)
+    points = view.image_points(camera.to(torch.float64), scans.shape[1:])  # of all lenses at once
     images = [
-        remap(scan, places, cv2.INTER_CUBIC) for scan, places in zip(scans, maps, strict=True)
+        cv2.remap(scan, of_scan, None, cv2.INTER_CUBIC)
+        for scan, of_scan in zip(scans, points.float().numpy(), strict=True)
     ]
     return torch.from_numpy(np.stack(images))[:, None], lenses
 

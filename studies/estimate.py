@@ -31,9 +31,8 @@ from darswin import load_model
 from darswin.calibrate import CalibrationError, lines
 from darswin.calibrate.boards import image_circle
 from darswin.calibrate.edges import curves
-from darswin.data import warp_map
-from darswin.data.warping import remap
 from darswin.lens import Lens, Perspective
+from darswin.views import CameraView
 
 SIZE = (480, 640)
 MIDDLE = ((SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2)
@@ -142,8 +141,9 @@ class Digits:
         self.labels = torch.from_numpy(digits.target[unseen])
         scans = (digits.images[unseen] / 16).astype(np.float32)
         camera = Perspective.from_fov(2 * min(angle(true, CIRCLE), WIDEST), scans.shape[2] / 2)
-        places = warp_map(camera, scans.shape[1:], self.square(true), (DIGIT, DIGIT))[0]
-        images = [remap(scan, places, cv2.INTER_CUBIC) for scan in scans]
+        remap = CameraView(self.square(true), reads=1).at(camera, scans.shape[1:])
+        points = remap.points.astype(np.float32)
+        images = [cv2.remap(scan, points, None, cv2.INTER_CUBIC) for scan in scans]
         self.images, self.model = (
             torch.from_numpy(np.stack(images))[:, None],
             load_model("digits")[0],

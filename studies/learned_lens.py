@@ -33,12 +33,12 @@ from learned_tables import collect
 from torch import Tensor
 
 from darswin.cli.main import main as darswin
-from darswin.data import open_source, warp_map
-from darswin.data.warping import remap
+from darswin.data import open_source
 from darswin.lens import Lens, Perspective, Spherical
 from darswin.models import DarSwin
 from darswin.models.saving import load_model, model_of_run
 from darswin.utils.files import replace_file
+from darswin.views import CameraView
 
 HERE = Path(__file__).parent
 FOV, SIZE, RENDER = (
@@ -84,10 +84,8 @@ def photograph(pictures: np.ndarray, lens: Lens) -> Tensor:
     """Images (N, 1, SIZE, SIZE) of pictures (N, H, W) uint8 through a lens, as in `WideAngle`."""
     camera = Perspective.from_fov(FOV, pictures.shape[1] / 2)
     large = lens.resized(RENDER / SIZE)
-    (places,) = warp_map(camera, pictures.shape[1:], large, (RENDER, RENDER))
-    images = [
-        cv2.resize(remap(p, places), (SIZE, SIZE), interpolation=cv2.INTER_AREA) for p in pictures
-    ]
+    remap = CameraView(large, (RENDER, RENDER), reads=1).at(camera, pictures.shape[1:])
+    images = [cv2.resize(remap(p), (SIZE, SIZE), interpolation=cv2.INTER_AREA) for p in pictures]
     return torch.from_numpy(np.stack(images))[:, None].float() / (255 * STD)
 
 

@@ -105,9 +105,10 @@ class Crops:
             if name not in self._views:
                 view = make_view(name, (SIZE, SIZE))
                 seen = view(self.image, lens.to(torch.float32))[0].permute(1, 2, 0).numpy()
-                self._views[name] = view, seen.clip(0, 255).astype(np.uint8)
-            view, seen = self._views[name]
-            box, _ = boxes.carry(thing.box[None], lambda xy: view.to_view(xy, lens, (SIZE, SIZE)))
+                remap = view.at(lens, (SIZE, SIZE))
+                self._views[name] = remap, seen.clip(0, 255).astype(np.uint8)
+            remap, seen = self._views[name]
+            box, _ = boxes.carry(thing.box[None], remap.to_view)
             return square_crop(seen, box[0])
 
         return crop

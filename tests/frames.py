@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from sklearn.datasets import load_digits
 
-from darswin.data.warping import remap, warp_map
-from darswin.lens import Perspective, load
+from darswin.data import fitted
+from darswin.lens import Lens, Perspective, load
+from darswin.utils.tasks import Fit
+from darswin.views import CameraView
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 WOODSCAPE = CALIBRATIONS / "woodscape.json"
@@ -26,14 +28,30 @@ def write_frames(
 ) -> Path:
     """The first `count` digits of some classes as frames, in one folder a class."""
     digits, lens = load_digits(), load(calibration).in_picture(size)
-    places = warp_map(Perspective.from_fov(FOV, 48), (96, 96), lens, size)[0]
+    remap = CameraView(lens, size, reads=1).at(Perspective.from_fov(FOV, 48), (96, 96))
     chosen = [k for k, label in enumerate(digits.target) if str(label) in classes][:count]
     for k in chosen:
         file = folder / str(digits.target[k]) / f"{k}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
         picture = (digits.images[k] * (255 / 16)).astype(np.uint8)
-        cv2.imwrite(str(file), remap(cv2.resize(picture, (96, 96)), places))
+        cv2.imwrite(str(file), remap(cv2.resize(picture, (96, 96))))
     return folder
+
+
+def at_size(image: np.ndarray, lens: Lens, size: int, fit: Fit) -> tuple[np.ndarray, Lens]:
+    """A picture and its lens at a model's size."""
+    remap = fitted(image.shape[:2], size, fit).at(lens, image.shape[:2])
+    return remap(image), remap.camera
+
+
+def warped(image: np.ndarray, own: Lens, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """A picture as another lens had seen it, by OpenCV and the formulas of the lenses."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    rays = lens.to(torch.float64).unproject_points(
+        torch.from_numpy(np.stack((x, y), -1)[None]), size
+    )
+    there = own.to(torch.float64).project_points(rays, image.shape[:2])[0].nan_to_num(-10.0)
+    return cv2.remap(image, there.float().numpy(), None, cv2.INTER_LINEAR)
 
 
 def blob(at: Sequence[float], size: tuple[int, int], width: float) -> np.ndarray:

@@ -17,7 +17,6 @@ import darswin
 from darswin import boxes
 from darswin.boxes.carried import cut_polygon
 from darswin.data.labels.labels import Thing, move_things
-from darswin.data.reframing import Warped
 from darswin.lens import (
     Equidistant,
     Equisolid,
@@ -27,8 +26,15 @@ from darswin.lens import (
     Spherical,
     Stereographic,
 )
+from darswin.views import CameraView
 
 SIZE = (640, 640)
+
+
+def warped(own, lens):
+    return CameraView(lens).at(own, tuple(own.image_size[0].int().tolist()))
+
+
 PRECISE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 
 
@@ -104,9 +110,9 @@ def flat_and_wide():
     wide = Equidistant(193.0, 1.65, image_size=(240, 640))
     narrow = Equidistant(200.0, 0.6, image_size=(256, 256))
     return {
-        "border": (Warped(flat, wide), [[164.5, 90, 437.6, 96.5], [20, 20, 300, 300]]),
-        "θ_max": (Warped(flat, narrow), [[60, 60, 452, 452], [90, 200, 300, 240]]),
-        "source": (Warped(wide, flat), [[-300, -50, 200, 100], [450, 60, 640, 200]]),
+        "border": (warped(flat, wide), [[164.5, 90, 437.6, 96.5], [20, 20, 300, 300]]),
+        "θ_max": (warped(flat, narrow), [[60, 60, 452, 452], [90, 200, 300, 240]]),
+        "source": (warped(wide, flat), [[-300, -50, 200, 100], [450, 60, 640, 200]]),
     }
 
 
@@ -117,11 +123,11 @@ def test_a_box_that_is_cut_is_that_of_what_is_left_of_its_ellipse(way):
     radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None, None]
     angle = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
     circle = np.stack((np.cos(angle), np.sin(angle)), -1)
-    carried, visible = boxes.carry(table, to.to_new, to.size)
+    carried, visible = boxes.carry(table, to.to_view, to.view_size)
     for box, found, share in zip(np.array(table, float), carried, visible, strict=True):
         middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2
-        points = to.to_new(middle + radius * half * circle - 0.5) + 0.5
-        seen = ((points >= 0) & (points <= to.size[::-1])).all(-1)
+        points = to.to_view(middle + radius * half * circle - 0.5) + 0.5
+        seen = ((points >= 0) & (points <= to.view_size[::-1])).all(-1)
         assert share == pytest.approx(seen.mean(), abs=2e-3) and 0.01 < share < 0.99
         assert boxes.iou(found[None], box_of(points[seen])[None])[0, 0] > 0.97
         outline = middle + half * circle[::40]
@@ -129,11 +135,11 @@ def test_a_box_that_is_cut_is_that_of_what_is_left_of_its_ellipse(way):
         for thing in move_things(things, to):
             assert boxes.iou(found[None], thing.box[None])[0, 0] > 0.99
             assert thing.visible == pytest.approx(share, abs=2e-3)
-        mask = np.zeros(to.size, np.uint8)
+        mask = np.zeros(to.view_size, np.uint8)
         outlines = [np.rint((one - 0.5) * 16).astype(np.int32) for one in thing.polygons]
         cv2.fillPoly(mask, outlines, 1, shift=4)
-        y, x = np.mgrid[: to.size[0], : to.size[1]].astype(float)
-        old = (to.to_old(np.stack((x, y), -1)) + 0.5 - middle) / half
+        y, x = np.mgrid[: to.view_size[0], : to.view_size[1]].astype(float)
+        old = (to.to_image(np.stack((x, y), -1)) + 0.5 - middle) / half
         want = (old**2).sum(-1) <= 1  # not for NaN
         if want.sum() > 2000:  # OpenCV fills the border too
             assert (want & (mask > 0)).sum() / (want | (mask > 0)).sum() > 0.96
@@ -174,7 +180,7 @@ def test_boxes_and_polygons_agree_with_opencv_through_fisheye_lenses():
         flat = shapes.reshape(-1, 1, 2) - 0.5
         flat = cv2.fisheye.undistortPoints(flat, k_old, d_old, criteria=PRECISE)
         want = cv2.fisheye.distortPoints(flat, k_new, d_new).reshape(shapes.shape) + 0.5
-        to_new = Warped(old, new).to_new
+        to_new = warped(old, new).to_view
         worst = max(worst, np.abs(boxes.carry_points(shapes, to_new) - want).max())
         carried, visible = boxes.carry(box_of(shapes), to_new)
         assert (visible == 1).all()
@@ -208,22 +214,22 @@ def test_mean_overlap_with_exact_boxes_over_random_lenses():
     there, there_and_back, corners, polygons = [], [], [], []
     for _ in range(60):
         fov = math.radians(rng.uniform(100, 200))
-        maps = Warped(random_lens(rng, fov), random_lens(rng, fov))
+        maps = warped(random_lens(rng, fov), random_lens(rng, fov))
         middles = rng.uniform(100, 540, (10, 1, 2))
         shapes = middles + rng.uniform(15, 60, (10, 1, 1)) * outlines(rng, 10)
-        exact = boxes.carry_points(shapes, maps.to_new)
+        exact = boxes.carry_points(shapes, maps.to_view)
         whole = ~np.isnan(exact).any((1, 2))
         shapes, exact = shapes[whole], exact[whole]
         table = box_of(shapes)
-        carried, _ = boxes.carry(table, maps.to_new)
+        carried, _ = boxes.carry(table, maps.to_view)
         there.extend(paired_iou(carried, box_of(exact)))
-        there_and_back.extend(paired_iou(boxes.carry(carried, maps.to_old)[0], table))
+        there_and_back.extend(paired_iou(boxes.carry(carried, maps.to_image)[0], table))
         rectangle = table[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
         corners.extend(
-            paired_iou(box_of(boxes.carry_points(rectangle, maps.to_new)), box_of(exact))
+            paired_iou(box_of(boxes.carry_points(rectangle, maps.to_view)), box_of(exact))
         )
         for shape, true in zip(shapes, exact, strict=True):
-            coarse = boxes.carry_polygon(shape[::18], maps.to_new)
+            coarse = boxes.carry_polygon(shape[::18], maps.to_view)
             polygons.extend(paired_iou(box_of(coarse)[None], box_of(true)[None]))
     assert len(there) > 300
     assert np.mean(there) >= 0.98 and np.mean(there_and_back) >= 0.965
@@ -241,15 +247,15 @@ def test_a_mask_through_a_lens_agrees_with_opencv_pixel_by_pixel():
     flat = cv2.fisheye.undistortPoints(grid.reshape(-1, 1, 2), k_new, d_new)
     places = cv2.fisheye.distortPoints(flat, k_old, d_old).reshape(grid.shape)
     want = map_coordinates(mask, places[..., ::-1].transpose(2, 0, 1), order=0, cval=0)
-    maps = Warped(old, new)
-    found = boxes.carry_mask(mask, maps.to_old, SIZE)
+    maps = warped(old, new)
+    found = boxes.carry_mask(mask, maps.to_image, SIZE)
     assert found.dtype == np.uint8 and found[200:560, 100:500].sum() == found.sum() > 0
     assert (found[200:560, 100:500] != want).sum() <= 2  # ties
     rows, columns = np.nonzero(mask)
     box = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
     rows, columns = np.nonzero(found)
     new_box = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
-    assert boxes.iou(boxes.carry(box, maps.to_new)[0], new_box)[0, 0] > 0.95
+    assert boxes.iou(boxes.carry(box, maps.to_view)[0], new_box)[0, 0] > 0.95
 
 
 def test_polygons_are_cut_finely_and_lose_what_is_not_seen():

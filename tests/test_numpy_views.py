@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 from darswin import boxes, frames, views
 from darswin.calibrate import calibrate
 from darswin.calibrate.inputs import checked
-from darswin.data import FullSize, Moved, Turn, at_size
+from darswin.data import FullSize, fitted
 from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial
 from darswin.viz import pixels
 from darswin.viz.plot import draw_polar
-from darswin.viz.views import undistort
 from tests import rigs
 
 RNG = np.random.default_rng(0)
@@ -29,7 +28,9 @@ PICTURE = RNG.integers(0, 256, (*SIZE, 3), np.uint8)
 VALUES = RNG.uniform(1, 9, (48, 48)).astype(np.float32)
 PLACES = RNG.uniform(10, 40, (6, 2))
 BOXES = np.concatenate((PLACES, PLACES + 8), 1)
-FULL, MOVED = FullSize(CAMERA, 48, "crop"), Moved(CAMERA, (4, 4, 40, 40), (30, 30), Turn(0.3))
+FULL = FullSize(fitted(SIZE, 48, "crop").at(CAMERA, SIZE))
+MOVED = views.CropView((4, 4, 40, 40), (30, 30), views.Turn(0.3)).at(CAMERA, SIZE)
+REMAP = ROOM.at(CAMERA, SIZE)
 PLAN = camera.plan(ROOM, CAMERA, SIZE)
 FOUND = calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
 
@@ -63,16 +64,16 @@ CASES = {
         lambda a: views.up_of(extrinsics=a),
         rigs.turn(torch.tensor([0.1, 0.2, 0.3]).double()).numpy(),
     ),
-    "to_view": (lambda a: ROOM.to_view(a, CAMERA, SIZE), PLACES),
-    "to_image": (lambda a: ROOM.to_image(a, CAMERA, SIZE), PLACES / 2),
+    "to_view": (REMAP.to_view, PLACES),
+    "to_image": (REMAP.to_image, PLACES / 2),
     "corners": (lambda a: checked(a, RIG.board, RIG.size)[0].corners, CORNERS),
     "list of corners": (lambda a: checked([*a], RIG.board, RIG.size)[0].corners, CORNERS),
     "board": (lambda a: checked(CORNERS, a, RIG.size)[1], RIG.board.numpy()),
     "uncertainty": (FOUND.uncertainty, 10 * PLACES),
     "uncertainty_of_theta": (FOUND.uncertainty_of_theta, np.linspace(0.1, 1, 6)),
-    "carry": (lambda a: boxes.carry(a, MOVED.to_new)[0], BOXES),
-    "carry_points": (lambda a: boxes.carry_points(a, MOVED.to_new), PLACES),
-    "carry_polygon": (lambda a: boxes.carry_polygon(a, MOVED.to_new), PLACES),
+    "carry": (lambda a: boxes.carry(a, MOVED.to_view)[0], BOXES),
+    "carry_points": (lambda a: boxes.carry_points(a, MOVED.to_view), PLACES),
+    "carry_polygon": (lambda a: boxes.carry_polygon(a, MOVED.to_view), PLACES),
     "carry_mask": (lambda a: boxes.carry_mask(a, lambda p: p + 1.0, SIZE), VALUES > 5),
     "iou": (lambda a: boxes.iou(a, BOXES), BOXES + 1),
     "merge": (lambda a: boxes.merge(a, np.linspace(1, 0, 6), np.zeros(6, int)), BOXES),
@@ -80,12 +81,12 @@ CASES = {
     "spherical": (lambda a: boxes.spherical(a, _rays).ray, BOXES),
     "plan": (PLAN.points, PLACES / 2),
     "sampler": (frames.Sampler(PLAN), PICTURE),
-    "image": (MOVED.image, PICTURE),
+    "turned": (MOVED, PICTURE),
+    "picture": (REMAP, RNG.random(SIZE, np.float32)),
     "target": (MOVED.target, VALUES),
-    "at_size": (lambda a: at_size(a, CAMERA, 32, "whole")[0], PICTURE),
+    "resized picture": (fitted(SIZE, 32, "whole").at(CAMERA, SIZE), PICTURE),
     "labels": (FULL.labels, RNG.normal(size=(3, 48, 48)).astype(np.float32)),
     "distance": (FULL.distance, VALUES),
-    "undistort": (lambda a: undistort(a, CAMERA, ROOM), RNG.random(SIZE, np.float32)),
     "label_image": (lambda a: pixels.label_image(a, pixels.palette(9)), VALUES.astype(int)),
     "distance_image": (lambda a: pixels.distance_image(a, 1, 9), VALUES),
     "overlay": (lambda a: pixels.overlay(a, PICTURE[::-1]), PICTURE),

@@ -1,5 +1,6 @@
 """Data: images seen through lenses."""
 
+from darswin.data import labels
 from darswin.data.augment import Mixing, RandAugment
 from darswin.data.cameras import Calibrations
 from darswin.data.framing import FullSize, fitted
@@ -28,6 +29,7 @@ __all__ = [
     "SphericalLenses",
     "WideAngle",
     "fitted",
+    "labels",
     "open_scenes",
     "open_source",
 ]

@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 import torch
 
-from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles
 from darswin.utils.parameters import check
-from darswin.utils.tasks import Fit
+from darswin.utils.tasks import IGNORE, Fit
 from darswin.views import CropView, Remap
 from darswin.views.base import Pair
 from darswin.views.camera import picture_size

@@ -21,9 +21,7 @@ from darswin.utils.image import BrokenImageError, Header, read_header
 from darswin.utils.parameters import check
 from darswin.utils.tasks import Fit
 from darswin.views import CameraView, CropView, PixelView
-from darswin.views.base import Pair
 from darswin.views.camera import picture_size
-from darswin.views.crop import Part
 from darswin.views.turn import STILL, Turn
 
 # Per-channel statistics of ImageNet, in [0, 1].
@@ -48,6 +46,7 @@ class Samples(Dataset):
     """Base of the data sets, see `Calibrated`; subclasses define `_read` and `_lens_alone`."""
 
     _other = 1  # the purpose of the random numbers of `_other_lens`
+    _each_pixel = False  # of `CropView`
 
     def __init__(
         self,
@@ -155,17 +154,13 @@ class Samples(Dataset):
         if self.lens_augmentation is not None:
             return CameraView(self._other_lens(draw, own, crop), turn=turn)
         part = taken_part(picture_size(own), self.fit, crop)
-        return CropView(part, (self.size, self.size), turn, render=self._render(part))
+        return CropView(part, (self.size, self.size), turn, each_pixel=self._each_pixel)
 
     def _turn(self, draw: Draw) -> Turn:
         return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else STILL
 
     def _crop(self, draw: Draw) -> Crop | None:
         """A random part of the pictures."""
-        return None
-
-    def _render(self, part: Part) -> Pair | None:
-        """`CropView`'s number of points for a part of a turned picture."""
         return None
 
     def _other_lens(self, draw: Draw, own: Lens, crop: Crop | None = None) -> Lens:
@@ -245,6 +240,7 @@ class Calibrated(Samples):
     """
 
     source: Source
+    _each_pixel = True
 
     def __init__(self, source: Source, calibrations: Calibrations, **options):
         super().__init__(source, **options)
@@ -259,9 +255,6 @@ class Calibrated(Samples):
     def _check(self, index: int, headers: Sequence[Header]) -> None:
         (picture,) = headers
         self.calibrations.check(self.source.file(index), picture.upright, picture.orientation)
-
-    def _render(self, part: Part) -> Pair:
-        return part[2:]  # a point for each pixel
 
     def _lens_alone(self, draw: Draw) -> Lens:
         return self.calibrations.lens_alone(self.source.file(draw.picture))

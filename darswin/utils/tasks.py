@@ -9,3 +9,5 @@ PixelTask = Literal["segmentation", "distance"]
 # Ways to give a picture the size of a model: "crop" cuts the longer side, "stretch" squashes it,
 # "whole" keeps the aspect ratio and resizes the shorter side.
 Fit = Literal["crop", "stretch", "whole"]
+
+IGNORE = 255  # the label of an unlabelled pixel

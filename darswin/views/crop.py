@@ -10,7 +10,7 @@ from darswin.lens.pixels import pixel_rays
 from darswin.lens.solve import direction_of
 from darswin.ops.checks import check_pair
 from darswin.views.base import Pair, PerChannel
-from darswin.views.camera import flat_points, picture_size, points_along
+from darswin.views.camera import centres, flat_points, picture_size, points_along
 from darswin.views.pixels import PixelView
 from darswin.views.remap import Remap
 from darswin.views.turn import STILL, Turn
@@ -32,8 +32,8 @@ class CropView(PixelView):
     Args:
         part: top, left, height and width, px, in the turned picture, which keeps its size.
         size: (H', W') of the new picture. turn: about the optical axis.
-        render: (H, W), the number of points along the sides at which a turned picture is read. None
-            means up to 5 along each new pixel.
+        each_pixel: a rotated picture is read once for each pixel of the part. Otherwise it is read
+            at up to 5 points along each new pixel.
         mean, std: the arguments of `View`.
     """
 
@@ -45,12 +45,12 @@ class CropView(PixelView):
         size: Pair,
         turn: Turn = STILL,
         *,
-        render: Pair | None = None,
+        each_pixel: bool = False,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
         super().__init__(check_pair("size", size, 1), mean=mean, std=std)
-        self.part, self.turn, self._render = part, turn, render
+        self.part, self.turn, self.each_pixel = part, turn, each_pixel
 
     def camera(self, lens: Lens, size: Pair) -> Lens:
         return self._turned(lens, size)[0].cropped(*self.part).resized(self.size)
@@ -114,12 +114,12 @@ class CropView(PixelView):
 
         from darswin.utils.resize import area_resized
 
+        if self.turn.angle and not self.each_pixel:
+            return remap.sampled(picture)
         top, left, height, width = self.part
         if self.turn.angle:
-            reads = self.reads_of(remap.lens, remap.size)
-            render = self._render or (reads * self.size[0], reads * self.size[1])
-            onto = CropView(self.part, render, self.turn)._matrix(remap.lens, remap.size)
-            found = area_resized(cv2.warpAffine(picture, onto, render[::-1]), self.size)
+            onto = CropView(self.part, (height, width), self.turn)._matrix(remap.lens, remap.size)
+            found = area_resized(cv2.warpAffine(picture, onto, (width, height)), self.size)
         else:
             if self.turn.mirrored:
                 left = picture.shape[1] - left - width
@@ -127,10 +127,21 @@ class CropView(PixelView):
             found = found[:, ::-1] if self.turn.mirrored else found
         return np.ascontiguousarray(found).reshape(*self.size, *picture.shape[2:])
 
+    def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
+        reads = self.reads_of(lens, size)
+        return self._points(lens, size, *(centres(side, reads * side) for side in self.size))
+
     def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
-        points = super().points_of_target(lens, size)
+        points = self._points(lens, size, *map(np.arange, self.size))
         points[_unseen(self.camera(lens, size))] = np.nan
         return points
+
+    def _points(self, lens: Lens, size: Pair, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """`to_image` of the pixels at y (H,) and x (W,) for one lens, (H, W, 2)."""
+        turn, moves = np.split(self._matrix(lens, size), [2], 1)
+        back = np.linalg.inv(turn)
+        rows = zip(back.tolist(), (-back @ moves).ravel().tolist(), strict=True)
+        return np.stack([a * x + (b * y + c)[:, None] for (a, b), c in rows], -1)
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, part={self.part}, turn={self.turn}"

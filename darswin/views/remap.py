@@ -14,6 +14,7 @@ from darswin.lens import Lens
 from darswin.ops import _module
 from darswin.ops.checks import check_pair, per_channel, tensor_there
 from darswin.utils.arrays import as_tensor
+from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, check_lens
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ Points = TypeVar("Points", np.ndarray, Tensor)
 
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a picture is on it
 _NUDGE = 1e-3  # px, more than the rounding of points in float32
-UNKNOWN = 255  # of ids of 8 bits; distances and other maps have 0
 
 
 class MovedBoxes(NamedTuple):
@@ -185,13 +185,14 @@ class Remap:
         """
         if isinstance(picture, Tensor):
             return self.view.see(picture, self._prepared)
+        picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
         if picture.shape[:2] != self.size:
             raise ValueError(f"the picture must be (H, W) = {self.size}, got {picture.shape[:2]}")
         return self.view.picture(picture, self)
 
     def sampled(self, picture: np.ndarray) -> np.ndarray:
         """`remap(picture)` by points: compiled for uint8 and float32, else through torch."""
-        planes = np.atleast_3d(picture)
+        planes = np.ascontiguousarray(np.atleast_3d(picture))
         if picture.dtype in (np.uint8, np.float32) and _module.LACK is None:
             from darswin.frames.compiled import frames
 
@@ -258,15 +259,15 @@ class Remap:
             target: (H, W), of the picture.
 
         Returns:
-            (H', W'), of the same dtype; `UNKNOWN` in uint8, and 0 in others, where the view shows
-            nothing.
+            (H', W'), of the same dtype. Where the view shows nothing, it is `IGNORE` (255) in
+            uint8, and 0 in others.
         """
         x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
         height, width = self.size
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         target = np.asarray(target, target.dtype.newbyteorder("="))
         index = np.where(inside, y * width + x, 0).astype(np.intp)
-        return np.where(inside, target.ravel()[index], UNKNOWN if target.dtype == np.uint8 else 0)
+        return np.where(inside, target.ravel()[index], IGNORE if target.dtype == np.uint8 else 0)
 
     @cached_property
     def _target_points(self) -> np.ndarray:

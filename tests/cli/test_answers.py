@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from darswin.data.warping import CutOff
 from helpers import slow_but
 from PIL import Image
 from videos import write_video
@@ -26,7 +25,8 @@ from darswin.cli.answers import (
     label_png,
 )
 from darswin.cli.main import main
-from darswin.data import FullSize, at_size
+from darswin.data import FullSize, fitted
+from darswin.data.framing import CutOff
 from darswin.lens import Equidistant, KannalaBrandt, from_dict
 from darswin.lens.pixels import pixel_angles
 from darswin.models.base import Prepared
@@ -41,7 +41,7 @@ from darswin.viz.pixels import UNKNOWN, palette
 LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}
 COLORS = [[250, 0, 0], [0, 250, 0], [0, 0, 250]]
 NAMES = ["red", "green", "blue"]
-FULL = FullSize(from_dict(LENS), 48, "crop")
+FULL = FullSize(fitted((48, 64), 48, "crop").at(from_dict(LENS), (48, 64)))
 SEEN = FULL.seen
 
 
@@ -330,10 +330,10 @@ def test_a_real_model_answers_as_in_python(tmp_path):
     lens = LENS | {"image_size": [140, 160]}
     argv = ["predict", picture, "--model", str(tmp_path / "m.safetensors"), "--out", str(out)]
     main([*argv, "--lens", json.dumps(lens)])
-    small, small_lens = at_size(image, from_dict(lens), size, "crop")
+    remap = fitted((140, 160), size, "crop").at(from_dict(lens), (140, 160))
     with torch.no_grad():
-        output = model(torch.from_numpy(small)[None], small_lens)[0].numpy()
-    expected = FullSize(from_dict(lens), size, "crop").labels(output)
+        output = model(torch.from_numpy(remap(image))[None], remap.camera)[0].numpy()
+    expected = FullSize(remap).labels(output)
     assert (ids(out / "labels/p.png") == expected).mean() > 0.998
 
 

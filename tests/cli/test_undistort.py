@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from darswin.viz.views import undistort
 from PIL import ExifTags, Image
 from videos import turn_video, write_video
 
@@ -152,7 +151,7 @@ def test_a_panorama_of_a_camera_that_looks_down(folder):
     out = run(folder, "--view=panorama", "--up=0,0,-1", "--size=40,100")
     lens = lenses.load(folder / "fisheye.yaml", coefficients="fisheye").with_theta_max(None)
     view = make_view("panorama", (40, 100), up=(0, 0, -1))
-    found, expected = read(out / "a.png"), undistort(picture(), lens, view)
+    found, expected = read(out / "a.png"), view.at(lens, picture().shape[:2])(picture())
     assert np.abs(found.astype(int) - expected).max() <= 3
     seen = (found.max(-1) > 0).mean(0)
     assert (seen > 0.4).all()  # in every direction around

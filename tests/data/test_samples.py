@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from darswin.data.warping import remap
-from frames import CALIBRATIONS, WOODSCAPE, write_frames
+from frames import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from helpers import slow_but
 from PIL import ExifTags, Image
 from scenes import write_plain
@@ -21,10 +20,8 @@ from darswin.data import (
     SceneSamples,
     SphericalLenses,
     WideAngle,
-    at_size,
     open_scenes,
     open_source,
-    warp_map,
 )
 from darswin.data.order import TrainingOrder
 from darswin.data.pictures import Arrays
@@ -217,8 +214,8 @@ def test_a_picture_as_another_lens_had_seen_it(folders):
     assert label == dataset.source[3][1] and isinstance(lens, Spherical)
     assert lens.theta_max.item() == pytest.approx(own.theta_max.item(), rel=1e-5)
     own = own.in_picture(picture.shape[:2])
-    (places,) = warp_map(own, picture.shape[:2], lens.resized((192, 192)), (192, 192))
-    expected = cv2.resize(remap(picture, places), (24, 24), interpolation=cv2.INTER_AREA)
+    large = warped(picture, own, lens.resized((192, 192)), (192, 192))
+    expected = cv2.resize(large, (24, 24), interpolation=cv2.INTER_AREA)
     assert np.abs(255 * image[0].numpy() - expected).mean() < 3
     assert str(dataset[Draw(1, 3, 3)][1]) != str(lens)  # another lens in each epoch
 

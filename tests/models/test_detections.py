@@ -119,7 +119,7 @@ def test_every_form_of_detections_gives_the_same():
     batched = LensAdapter(Batched(), view=view)(images, lens)
     assert [found["own"].tolist() for found in batched] == [[0, 1], [2, 3]]
     boxes = torch.tensor([[20.0, 30.0, 60.0, 90.0], [100.0, 90.0, 160.0, 150.0]])
-    exact, _ = of_boxes.carry(boxes, lambda p: view.to_image(p, lens, SIZE))
+    exact, _ = of_boxes.carry(boxes, view.at(lens, SIZE).to_image)
     for found in batched:
         torch.testing.assert_close(found["boxes"], exact, rtol=0, atol=0.02)
     single = LensAdapter(_Constant(boxes), view=view)(images[:1], lens)

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from darswin.data.warping import remap
+from frames import at_size
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
 from darswin.cli.predict import predict
-from darswin.data import at_size, warp_map
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load
@@ -22,6 +21,7 @@ from darswin.models import ModelCard, create_model, list_models, load_model
 from darswin.models.registry import list_pretrained, model_class, preset, pretrained_file
 from darswin.models.saving import read_card
 from darswin.train.classification import Classification
+from darswin.views import CameraView
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,11 +73,12 @@ def test_digits_in_picture_files(demo, unseen):
     assert [float(xi) for _, xi in said] == [0, 0.5, 1]
     for percent, xi in said:
         taken_with = Spherical.from_fov(float(xi), demo.FOV, 128)
-        (places,) = warp_map(Perspective.from_fov(demo.FOV, 4), (8, 8), taken_with, (256, 256))
+        view = CameraView(taken_with, (256, 256), reads=1)
+        points = view.at(Perspective.from_fov(demo.FOV, 4), (8, 8)).points.astype(np.float32)
         taken_with = taken_with.replace(image_size=torch.tensor([[256, 256]]))
         small = []
         for scan in unseen[0]:
-            picture = remap(scan, places, cv2.INTER_CUBIC).clip(0, 1)
+            picture = cv2.remap(scan, points, None, cv2.INTER_CUBIC).clip(0, 1)
             pixels = np.round(picture * 255).astype(np.uint8)[..., None]
             image, lens = at_size(pixels, taken_with, card.size, card.fit)
             small.append(image)

@@ -16,7 +16,7 @@ from torchmetrics.classification import MulticlassAccuracy
 
 from darswin import create_model, lens
 from darswin.cli.options import PRESETS
-from darswin.data.warping import CutOff
+from darswin.data.framing import CutOff
 from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData

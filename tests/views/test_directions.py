@@ -95,16 +95,15 @@ def test_points_go_through_every_lens_and_come_back(name, model):
     view = make_view(name, size if name == "none" else (200, 200))
     places = np.random.default_rng(0).uniform(0, 1, (1000, 2)) * size[::-1] - 0.5
     shares = []
-    for tile in range(view.count):
-        of_tile = dict(tile=tile) if view.count > 1 else {}
-        points = view.to_view(places, lens, size, **of_tile)
+    for tile in view.at(lens, size).tiles:
+        points = tile.to_view(places)
         seen = ((points > 0) & (points < (size[::-1] if name == "none" else 199))).all(-1)
         shares.append(seen.mean())
-        again = view.to_image(points[seen], lens, size, **of_tile)
+        again = tile.to_image(points[seen])
         np.testing.assert_allclose(again, places[seen], rtol=0, atol=2e-4)
     assert max(shares) > 0.01
-    beyond = view.to_view(np.array([[-2.0, 5.0], [5.0, size[0] + 1.0]]), lens, size, **of_tile)
-    assert np.isnan(view.to_image(beyond, lens, size, **of_tile)).any(-1).all()
+    beyond = tile.to_view(np.array([[-2.0, 5.0], [5.0, size[0] + 1.0]]))
+    assert np.isnan(tile.to_image(beyond)).any(-1).all()
 
 
 @every_ray_view
@@ -112,7 +111,7 @@ def test_what_a_view_reads_is_where_its_points_go(name):
     view = make_view(name, (40, 50), reads=1)
     prepared = view.prepare(WIDE, SIZE)
     grid = np.stack(np.meshgrid(np.arange(50.0), np.arange(40.0)), -1)
-    places = view.to_image(grid, WIDE, SIZE)
+    places = view.at(WIDE, SIZE).to_image(grid)
     read = prepared.points[0].double().numpy()
     seen = ~np.isnan(places).any(-1)
     assert (read[~seen] == -10).all()
@@ -176,7 +175,9 @@ def test_pixels_are_means_of_their_points(name):
         parts = make_view(name, (64 * reads, 64 * reads), reads=1, **options)(image, WIDE)
         torch.testing.assert_close(mean, F.avg_pool2d(parts, reads), rtol=0, atol=2e-4)
     assert (fine(image, WIDE) - mean).abs().mean() > 0.05
-    large, small = (make_view(name, (side, side)).reads_of((1080, 1920)) for side in (720, 128))
+    large, small = (
+        make_view(name, (side, side)).reads_of(WIDE, (1080, 1920)) for side in (720, 128)
+    )
     assert (large, small) == (1, 4)
 
 
@@ -347,14 +348,14 @@ def test_angles_and_extrinsics_are_one_or_the_other():
         with pytest.raises(ValueError, match="must be a rotation"):
             up_of(extrinsics=wrong)
     with pytest.raises(ValueError, match="one lens, got 2"):
-        make_view("mercator", (8, 8)).to_image(np.zeros((1, 2)), Equidistant([9.0, 9.0]), SIZE)
+        make_view("mercator", (8, 8)).at(Equidistant([9.0, 9.0]), SIZE)
 
 
 @every_ray_view
 def test_a_view_for_one_lens_is_the_same_view(name):
     lens, other = (Equidistant.from_fov(f, 60.0, image_size=(120, 160)).to(f64) for f in (2.5, 1))
     view = make_view(name, (40, 50))
-    known, points = view.for_lens(lens, (120, 160)), 160 * torch.rand(9, 2, dtype=f64)
+    known, points = view.for_lens(lens, (120, 160)), 160 * torch.rand(1, 9, 2, dtype=f64)
     for one in (lens, other):
         found = known.to_view(points, one, (120, 160)), view.to_view(points, one, (120, 160))
         same = torch.equal(*(points.nan_to_num(-1) for points in found))
@@ -377,11 +378,11 @@ def test_sizes_of_views_are_pairs_or_the_side_of_a_square(name):
 @pytest.mark.parametrize("name", OF_PIXELS)
 def test_points_of_another_size_and_shape_are_refused(name):
     view, lens = make_view(name, (16, 16)), WIDE.replace(image_size=torch.tensor([SIZE]))
-    for move in (view.to_image, view.to_view):
-        with pytest.raises(ValueError, match=r"images of \(H, W\) = \(480, 640\)"):
-            move([[1.0, 2.0]], lens, (240, 320))
+    with pytest.raises(ValueError, match=r"images of \(H, W\) = \(480, 640\)"):
+        view.at(lens, (240, 320))
+    for move in (view.at(lens, SIZE).to_image, view.at(lens, SIZE).to_view):
         with pytest.raises(ValueError, match=r"points must have shape \(..., 2\), got \(3,\)"):
-            move([1.0, 2.0, 3.0], lens, SIZE)
+            move([1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize("name", RAY_VIEWS)
@@ -389,7 +390,7 @@ def test_pixels_and_rays_that_show_nothing_go_nowhere(name):
     view = make_view(name, (64, 64), fov=2.0, theta_max=0.5)
     y, x = np.indices(view.size, float)
     shown = view.rays(WIDE, SIZE)[0].any(-1).numpy()
-    places = view.to_image(np.stack((x, y), -1), WIDE, SIZE)
+    places = view.at(WIDE, SIZE).to_image(np.stack((x, y), -1))
     assert 0 < shown.mean() < 1
     assert (np.isfinite(places).all(-1) == shown).all()
     nowhere = torch.tensor([[[0.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]])

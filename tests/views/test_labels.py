@@ -79,18 +79,14 @@ def test_labels_of_every_form_go_through_every_lens_and_view(name):
     for model, (lens, middle, in_picture) in pictures().items():
         view = make_view(name, view_size, fov=2.0 if name == "perspective" else None)
         assert is_whole(in_picture)
-        for tile in range(view.count):
-            of_tile = dict(tile=tile) if view.count > 1 else {}
-            arguments = dict(lens=lens, size=SIZE, **of_tile)
-            in_view = cone(lambda p, k=arguments, v=view: v.to_rays(p, **k), view_size, middle)
+        for tile, remap in enumerate(view.at(lens, SIZE).tiles):
+            in_view = cone(lambda p, r=remap: r.rays(p[0])[None], view_size, middle)
             if not is_whole(in_view):
                 continue  # another tile sees it
             checked.add(model)
-            to_image = lambda p, k=arguments, v=view: v.to_image(p, **k)  # noqa: E731
-            to_view = lambda p, k=arguments, v=view: v.to_view(p, **k)  # noqa: E731
             for source, target, there, back in (
-                (in_view, in_picture, to_image, to_view),
-                (in_picture, in_view, to_view, to_image),
+                (in_view, in_picture, remap.to_image, remap.to_view),
+                (in_picture, in_view, remap.to_view, remap.to_image),
             ):
                 where = (model, tile, target.shape)
                 mask = of_boxes.carry_mask(source, back, target.shape)
@@ -128,9 +124,8 @@ def test_points_of_views_are_those_of_opencv(name):
     view, size = make_view(name, (side, side), fov=fov), (480, 640)
     for lens, (pixels, _) in theirs:
         exact = lens.to(torch.float64)
-        found = view.to_image(flat / step + (side - 1) / 2, exact, size)
+        remap = view.at(exact, size)
+        found = remap.to_image(flat / step + (side - 1) / 2)
         np.testing.assert_allclose(found, pixels[:, 0], atol=2e-3)
-        keypoints = of_boxes.carry_points(
-            pixels[:, 0] + 0.5, lambda p, lens=exact: view.to_view(p, lens, size)
-        )
+        keypoints = of_boxes.carry_points(pixels[:, 0] + 0.5, remap.to_view)
         np.testing.assert_allclose(keypoints, flat / step + side / 2, atol=2e-3)

@@ -120,7 +120,7 @@ def shift_of(key, view, prepared):
     y, x = 14, 40
     middle = place_in(key, x, y)
     assert middle is not None
-    there = view.to_view(np.array([[float(x), float(y)]]), LENS, SIZE)[0]
+    there = view.at(LENS, SIZE).to_view(np.array([[float(x), float(y)]]))[0]
     assert there[0] == pytest.approx(middle[0], abs=1e-3)
     return float(there[1] - middle[1])
 

@@ -13,9 +13,8 @@ from PIL import Image, UnidentifiedImageError
 from darswin.data.splits import some
 from darswin.utils.image import BrokenImageError, Header, decoded, file_content, read_header
 from darswin.utils.parameters import naming
-from darswin.utils.tasks import PixelTask
+from darswin.utils.tasks import IGNORE, PixelTask
 
-IGNORE = 255  # the label of an unlabelled pixel
 PER_METRE = 256  # the scale of distances in a PNG of 16 bits
 Target = Literal["labels", "distance"]
 # The targets of the tasks that predict each pixel.

@@ -11,7 +11,6 @@ import yaml
 from scenes import write_woodscape
 
 from darswin.boxes import encode_rle
-from darswin.data import Moved
 from darswin.data.labels import (
     Labels,
     Thing,
@@ -24,6 +23,7 @@ from darswin.data.labels import (
     write_yolo,
 )
 from darswin.lens import Equidistant
+from darswin.views import CropView
 
 SIZE = (60, 80)
 MASK = np.zeros(SIZE, np.uint8)
@@ -229,7 +229,7 @@ def test_a_turned_box_of_cvat_is_that_of_its_turned_ellipse(tmp_path):
     again = json.loads((tmp_path / "again.json").read_text())["annotations"][0]
     assert again["attributes"] == {"rotation": pytest.approx(30), "occluded": True}
     lens = Equidistant(20.0, 1.6, image_size=SIZE)
-    (thing, *_), *_ = moved(data.labels(0), Moved(lens, (0, 0, *SIZE), SIZE))
+    (thing, *_), *_ = moved(data.labels(0), CropView((0, 0, *SIZE), SIZE).at(lens, SIZE))
     sin, cos = math.sin(math.radians(30)), math.cos(math.radians(30))
     half = np.hypot([15 * cos, 15 * sin], [7.5 * sin, 7.5 * cos])
     middle = np.array([25, 27.5])

@@ -9,24 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.boxes import decode_rle, encode_rle, iou
-from darswin.data import Moved, Sample, Turn, Warped, reframe
+from darswin.data import Sample
 from darswin.data.labels import Labels, Thing, moved
 from darswin.data.labels.labels import LEAST_VISIBLE
 from darswin.lens import Equidistant, Perspective, Spherical
+from darswin.views import CameraView, CropView, Turn
 
 SIZE = (240, 320)
 LENS = Equidistant(110.0, 1.6, center=[158.0, 121.0], image_size=SIZE)
 WIDE = Spherical.from_fov(0.8, 2.4, 150.0, image_size=(300, 300))
 WAYS = {
-    "crop": lambda: Moved(LENS, (20, 50, 200, 230), (200, 230)),
-    "smaller": lambda: Moved(LENS, (0, 0, *SIZE), (120, 160)),
-    "larger": lambda: Moved(LENS, (40, 60, 160, 200), (400, 500)),
-    "oblong": lambda: Moved(LENS, (0, 0, *SIZE), (240, 200)),
-    "turned": lambda: Moved(LENS, (0, 0, *SIZE), SIZE, Turn(0.4)),
-    "mirrored": lambda: Moved(LENS, (0, 0, *SIZE), SIZE, Turn(0.0, True)),
-    "all": lambda: Moved(LENS, (10, 30, 220, 270), (330, 270), Turn(-0.3, True)),
-    "other lens": lambda: Warped(LENS, WIDE),
-    "other lens, turned": lambda: Warped(LENS, WIDE, Turn(0.5, True)),
+    "crop": CropView((20, 50, 200, 230), (200, 230)),
+    "smaller": CropView((0, 0, *SIZE), (120, 160)),
+    "larger": CropView((40, 60, 160, 200), (400, 500)),
+    "oblong": CropView((0, 0, *SIZE), (240, 200)),
+    "turned": CropView((0, 0, *SIZE), SIZE, Turn(0.4)),
+    "mirrored": CropView((0, 0, *SIZE), SIZE, Turn(0.0, True)),
+    "all": CropView((10, 30, 220, 270), (330, 270), Turn(-0.3, True)),
+    "other lens": CameraView(WIDE),
+    "other lens, turned": CameraView(WIDE, turn=Turn(0.5, True)),
 }
 
 
@@ -57,14 +58,13 @@ def mask_box(mask):
 @pytest.mark.parametrize("form", ["polygon", "mask", "box"])
 def test_labels_follow_the_picture(way, form):
     """The thing is white in a black picture. The new picture shows where it is."""
-    reframing = WAYS[way]()
     outline = blob((150, 115), 40)
     mask = filled([outline])
     thing = Thing(7, box_of(outline), **{
         "polygon": {"polygons": [outline]}, "mask": {"rle": encode_rle(mask)}, "box": {},
     }[form])  # fmt: skip
     image = np.repeat(mask[..., None] * np.uint8(255), 3, 2)
-    sample = reframe(Sample(image, Labels([thing], SIZE), LENS), reframing)
+    sample = Sample(image, Labels([thing], SIZE), LENS).through(WAYS[way])
     assert isinstance(sample.target, Labels)
     (found,), size, lost = sample.target
     assert size == sample.image.shape[:2] and lost == 0 and found.category == 7
@@ -89,7 +89,7 @@ def square(x, y, side=20.0):
 
 
 def cropped(*part):
-    return Moved(LENS, part, part[2:])
+    return CropView(part, part[2:]).at(LENS, SIZE)
 
 
 def test_what_leaves_the_picture():
@@ -141,7 +141,7 @@ def test_keypoints():
     person = Thing(1, np.array([40.0, 50, 160, 80]), keypoints=points, mirror=[1, 0, 2, 3])
     (crop,) = moved(Labels([person], SIZE), cropped(10, 20, 100, 100)).things
     np.testing.assert_allclose(crop.keypoints, [[30, 50, 2], [0] * 3, [0] * 3, [50, 60, 2]])
-    (turned,) = moved(Labels([person], SIZE), WAYS["mirrored"]()).things
+    (turned,) = moved(Labels([person], SIZE), WAYS["mirrored"].at(LENS, SIZE)).things
     np.testing.assert_allclose(
         turned.keypoints, [[170, 60, 1], [270, 60, 2], [0] * 3, [250, 70, 2]], atol=1e-9
     )
@@ -150,13 +150,13 @@ def test_keypoints():
 class Shifted:
     """A view all around of 100 px: what leaves it on one side is on the other."""
 
-    size, mirrored = (80, 100), False
+    view_size, mirrored = (80, 100), False
 
-    def to_new(self, points):
+    def to_view(self, points):
         return np.stack(((points[..., 0] + 30.5) % 100 - 0.5, points[..., 1]), -1)
 
     def target(self, target):
-        return np.roll(target, 30, 1)[: self.size[0]]
+        return np.roll(target, 30, 1)[: self.view_size[0]]
 
 
 @pytest.mark.parametrize("form", ["polygon", "box"])
@@ -171,9 +171,9 @@ def test_a_thing_at_the_seam_of_a_view_keeps_its_larger_part(form):
 class Half:
     """Nothing is seen beyond the column 49."""
 
-    size, mirrored = (80, 100), False
+    view_size, mirrored = (80, 100), False
 
-    def to_new(self, points):
+    def to_view(self, points):
         return np.where(points[..., :1] <= 49.5, points, np.nan)
 
 
@@ -192,7 +192,7 @@ def test_a_thing_that_is_partly_unseen():
 )
 def test_any_boxes_move(corners, way):
     things = [Thing(1, np.array([x, y, x + abs(w), y + abs(h)])) for x, y, w, h in corners]
-    found = moved(Labels(things, SIZE), WAYS[way]())
+    found = moved(Labels(things, SIZE), WAYS[way].at(LENS, SIZE))
     assert len(found.things) + found.lost == len(things)
     for thing in found.things:
         assert (thing.box[:2] >= -1e-9).all() and (thing.box[2:] <= found.size[::-1]).all()
@@ -222,7 +222,7 @@ def test_a_perspective_picture_through_a_fisheye_lens_by_formula():
     new = Equidistant.from_fov(math.radians(120), 150.0, image_size=(300, 300))
     outline = blob((200, 100), 30)
     thing = Thing(1, box_of(outline), [outline])
-    (found,) = moved(Labels([thing], SIZE), Warped(own, new)).things
+    (found,) = moved(Labels([thing], SIZE), CameraView(new).at(own, SIZE)).things
     flat = (outline - [160, 120]) / own.focal.item()
     radius = np.linalg.norm(flat, axis=1, keepdims=True)
     want = flat / radius * np.arctan(radius) * new.focal.item() + 150

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from frames import at_size
 from scenes import write_plain
 from torch.utils.data import DataLoader
 
@@ -11,7 +12,6 @@ from darswin.data import (
     PolynomialLenses,
     SceneSamples,
     SphericalLenses,
-    at_size,
     open_scenes,
 )
 from darswin.data.samples import Draw

@@ -11,19 +11,8 @@ from hypothesis import strategies as st
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 
-from darswin.data import (
-    IGNORE,
-    Moved,
-    RandomTurns,
-    Sample,
-    Turn,
-    Warped,
-    at_size,
-    lens_at_size,
-    reframe,
-)
-from darswin.data.reframing import STILL, Reframing
-from darswin.data.warping import Crop, taken_part
+from darswin.data import IGNORE, RandomTurns, Sample
+from darswin.data.framing import Crop, taken_part
 from darswin.lens import (
     BrownConrady,
     Equidistant,
@@ -35,7 +24,9 @@ from darswin.lens import (
     load,
 )
 from darswin.lens.orientation import upright
-from darswin.lens.pixels import pixel_angles, reprojection
+from darswin.lens.pixels import pixel_angles
+from darswin.views import CameraView, CropView, Turn
+from darswin.views.turn import STILL
 
 SIZE = (300, 400)
 LENSES = {
@@ -73,15 +64,15 @@ def scene_of(lens, target="labels"):
 
 
 def resized(source, taken, size, mirrored=False):
-    return reframe(source, Moved(source.lens, taken, (size, size), Turn(0.0, mirrored)))
+    return source.through(CropView(taken, (size, size), Turn(0.0, mirrored)))
 
 
 def turned(source, turn, taken, size):
-    return reframe(source, Moved(source.lens, taken, (size, size), turn))
+    return source.through(CropView(taken, (size, size), turn))
 
 
 def warped(source, lens, turn=STILL):
-    return reframe(source, Warped(source.lens, lens, turn))
+    return source.through(CameraView(lens, turn=turn))
 
 
 def before(lens, turn):
@@ -181,26 +172,9 @@ def test_image_and_labels_move_together(turn, crop, size, name):
         assert (scene.target[beyond] != IGNORE).sum() <= 0.02 * beyond.size
 
 
-@pytest.mark.parametrize("name", ["woodscape", "oblong", "pinhole"])
-def test_the_places_are_those_of_the_exact_reprojection(name):
-    height, width = SIZE
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    source = Sample(np.stack((x, y), -1), np.zeros(SIZE, np.float32), LENSES[name])
-    for lens in TARGETS:
-        pair = (source.lens.to(torch.float64), SIZE, lens.to(torch.float64), (128, 128))
-        exact = reprojection(*pair)[0]
-        got = torch.from_numpy(warped(source, lens).image)
-        inside = ((exact > 2) & (exact < exact.new_tensor([width - 3, height - 3]))).all(-1)
-        inside = torch.from_numpy(ndimage.binary_erosion(inside.numpy(), iterations=2))
-        # A mean over the pixel, and OpenCV's 1/32 px.
-        error = (got - exact)[inside].abs()
-        assert error.mean() < 0.03 and error.quantile(0.99) < 0.3
-
-
 def test_what_is_much_larger_is_averaged():
-    one = Equidistant(1.0, 1.5, image_size=(1, 1))
-    points = [Reframing(one, STILL, scale, None)._render for scale in (0.5, 1, 1.5, 2, 4.5, 5, 20)]
-    assert points == [(k, k) for k in (1, 1, 1, 3, 3, 5, 5)]
+    parts = [CropView((0, 0, part, part), (20, 20)) for part in (10, 20, 30, 40, 90, 100, 400)]
+    assert [view.reads_of(None, (400, 400)) for view in parts] == [1, 1, 1, 3, 3, 5, 5]
     lens = Equidistant.from_fov(3.0, 400.0, image_size=(800, 800), center=[399.5, 399.5])
     noise = np.random.default_rng(0).integers(256, size=(800, 800, 1), dtype=np.uint8)
     source = Sample(noise, np.zeros((800, 800), np.uint8), lens)
@@ -236,20 +210,20 @@ TANGENTIAL = BrownConrady(
 )
 
 
-def reframings(lens):
+def remaps(lens):
     """All kinds of maps of a lens's pictures."""
     for turn in (STILL, *TURNS):
-        yield Moved(lens, (20, 10, 150, 210), (60, 90), turn), turn
+        yield CropView((20, 10, 150, 210), (60, 90), turn).at(lens, size_of(lens))
         for other in (*TARGETS, OBLIQUE, TANGENTIAL):
-            yield Warped(lens, other, turn), turn
+            yield CameraView(other, turn=turn).at(lens, size_of(lens))
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_points_of_both_pictures_belong_together(name):
     lens = LENSES[name]
     azimuth = torch.linspace(-3, 3, 7, dtype=torch.float64)[None]
-    for reframing, turn in reframings(lens):
-        exact = lens.to(torch.float64), reframing.lens.to(torch.float64)
+    for remap in remaps(lens):
+        turn, exact = remap.view.turn, (lens.to(torch.float64), remap.camera.to(torch.float64))
         rays = torch.stack((azimuth.cos(), azimuth.sin()), -1)
         for theta in (0.0, 0.2, 0.6):
             old, new = (
@@ -258,27 +232,32 @@ def test_points_of_both_pictures_belong_together(name):
                     exact, (rays, rays @ torch.from_numpy(turn.matrix.T)), strict=True
                 )
             )
-            np.testing.assert_allclose(reframing.to_new(old), new, atol=2e-4)
-            np.testing.assert_allclose(reframing.to_old(new), old, atol=2e-3)
-        if isinstance(reframing, Warped):
+            np.testing.assert_allclose(remap.to_view(old), new, atol=2e-4)
+            found = remap.to_image(new)
+            inside = ((old > -0.49) & (old < np.array(size_of(lens))[::-1] - 0.51)).all(-1)
+            np.testing.assert_allclose(found[inside], old[inside], atol=2e-3)
+        if isinstance(remap.view, CameraView):
             beyond = np.array([[1e4, 1e4], old[0]])
-            assert np.isnan(reframing.to_new(beyond)).all(-1).tolist() == [True, False]
-            assert np.isnan(reframing.to_old(beyond[:1])).all()
+            assert np.isnan(remap.to_view(beyond)).all(-1).tolist() == [True, False]
+            assert np.isnan(remap.to_image(beyond[:1])).all()
 
 
 @pytest.mark.parametrize("name", [*LENSES, "wide pinhole"])
 def test_pixels_are_read_at_their_points(name):
     """The tables of a lens's curve are exact to a hundredth of a pixel, to the rim."""
     wide = Perspective(500.0, math.radians(80), [640.0, 480.0], image_size=(960, 1280))
-    for reframing, _ in reframings(LENSES.get(name, wide)):
-        y, x = (np.linspace(-1, side, 50) for side in reframing.size)
-        places = np.stack(reframing._places(y, x), -1)
-        exact = reframing.to_old(np.stack(np.meshgrid(x, y), -1))
+    for remap in remaps(LENSES.get(name, wide)):
+        view, lens = remap.view, remap.lens
+        if isinstance(view, CameraView) and not view.lens.is_radial:
+            continue  # it has no table
+        y, x = (np.linspace(-1, side, 50) for side in view.size)
+        points = view._points(lens, remap.size, y, x)
+        grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
+        exact = view.to_image(grid, lens, remap.size)[0].numpy()
         seen = ~np.isnan(exact)
-        assert seen.any() and np.abs(places - exact)[seen].max() < 0.013
-        height, width = size_of(LENSES.get(name, wide))
-        away = places[~seen.all(-1)]
-        assert ((away < -1) | (away > [width, height])).any(-1).all()
+        assert seen.any() and np.abs(points - exact)[seen].max() < 0.013
+        away = points[~seen.all(-1)]
+        assert ((away < -1) | (away > remap.size[::-1])).any(-1).all()
 
 
 @pytest.mark.slow
@@ -288,10 +267,10 @@ def test_content_moves_to_where_its_point_moves(name):
     for theta, azimuth in ((0.3, 0.4), (0.5, 2.5)):
         at = lens.project_rays(theta, azimuth)[0].numpy()
         spot = blob(at, size_of(lens), 4.0)
-        for reframing, _ in reframings(lens):
-            there = reframing.to_new(at)
-            if ((there > 12) & (there < np.subtract(reframing.size[::-1], 12))).all():
-                found = centroid(reframing.image(spot)).numpy()
+        for remap in remaps(lens):
+            there = remap.to_view(at)
+            if ((there > 12) & (there < np.subtract(remap.view_size[::-1], 12))).all():
+                found = centroid(remap(spot)).numpy()
                 np.testing.assert_allclose(found, there, atol=0.5)
 
 
@@ -299,19 +278,10 @@ def test_what_has_no_place_stays_as_it_is():
     image = np.zeros((*SIZE, 3), np.uint8)
     lens = LENSES["circle"]
     for target in (7, None):
-        for reframing in (Moved(lens, (0, 0, 90, 80), (9, 8)), Warped(lens, TARGETS[0])):
-            shown = reframe(Sample(image, target, lens), reframing)
-            assert shown.target is target and shown.lens is reframing.lens
-            assert shown.image.shape == (*reframing.size, 3)
-
-
-def test_a_picture_of_half_the_calibrated_size_gets_the_lens_of_its_size():
-    lens = load(CALIBRATIONS / "woodscape.json")
-    image, there = at_size(np.zeros((483, 640, 1), np.uint8), lens, 64, "stretch")
-    same = lens_at_size(lens.in_picture((483, 640)), 64, "stretch")
-    assert image.shape == (64, 64, 1) and str(there) == str(same)
-    with pytest.raises(ValueError, match=r"1280×966 .* but the picture is 640×500"):
-        at_size(np.zeros((500, 640, 1), np.uint8), lens, 64, "stretch")
+        for view in (CropView((0, 0, 90, 80), (9, 8)), CameraView(TARGETS[0])):
+            shown = Sample(image, target, lens).through(view)
+            assert shown.target is target and size_of(shown.lens) == view.size
+            assert shown.image.shape == (*view.size, 3)
 
 
 # -- turned about the optical axis ------------------------------------------------------------
@@ -334,7 +304,7 @@ SMALL_TURNS = [Turn(0.0, True), Turn(0.7, False), Turn(math.pi / 2, False), Turn
 def whole_turned(image, lens, turn):
     """A picture that keeps its size."""
     size = image.shape[:2]
-    image, _, lens = reframe(Sample(image, None, lens), Moved(lens, (0, 0, *size), size, turn))
+    image, _, lens = Sample(image, None, lens).through(CropView((0, 0, *size), size, turn))
     return image, lens
 
 

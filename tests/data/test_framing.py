@@ -1,6 +1,4 @@
-"""A ray stays on the same content, however picture and lens are warped or resized, and back."""
-
-import math
+"""A ray stays on the same content when picture and lens get a model's size, and back."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -9,51 +7,22 @@ import torch
 from frames import WOODSCAPE, blob, centroid
 from hypothesis import given
 
-from darswin.data import IGNORE, FullSize, at_size, lens_at_size, warp_map
-from darswin.data.warping import area_resized, cut_off, remap
-from darswin.lens import Equidistant, KannalaBrandt, Perspective, Spherical, load
+from darswin.data import IGNORE, FullSize, fitted
+from darswin.data.framing import cut_off
+from darswin.lens import Equidistant, KannalaBrandt, load
 from darswin.lens.orientation import upright
 from darswin.lens.pixels import pixel_angles
-
-# -- through another lens ---------------------------------------------------------------------
-
-
-def wave(lens, size):
-    """A smooth scene, in terms of the rays: an image of it through any lens can be computed."""
-    y, x = np.mgrid[:size, :size] - (size - 1) / 2
-    theta = lens.unproject(torch.from_numpy(np.hypot(x, y)).float()).numpy()
-    image = 0.5 + 0.4 * np.cos(4 * theta) * np.cos(np.arctan2(y, x))
-    return np.where(theta <= lens.theta_max.item(), image, 0).astype(np.float32)
+from darswin.utils.resize import area_resized
 
 
-def warp(image, source, target, size):
-    return remap(image, warp_map(source, image.shape, target, size)[0])
+def at_size(image, lens, size, fit):
+    remap = fitted(image.shape[:2], size, fit).at(lens, image.shape[:2])
+    return remap(image), remap.camera
 
 
-@pytest.mark.parametrize("xi", [0.0, 0.5, 1.0])
-def test_the_warped_image_is_what_the_other_lens_sees(xi):
-    source = Perspective.from_fov(math.radians(120), 200)
-    target = Spherical.from_fov(xi, math.radians(120), 60)
-    got = warp(wave(source, 400), source, target, (120, 120))
-    y, x = np.mgrid[:120, :120] - 59.5
-    inside = np.hypot(x, y) < 58
-    assert np.abs(got - wave(target, 120))[inside].max() < 0.02
-    assert (got[np.hypot(x, y) > 61] == 0).all()
-
-
-def test_warps_that_are_known():
-    image = np.random.default_rng(0).random((40, 48)).astype(np.float32)
-    lens = Perspective(30.0, 1.0)
-    assert np.array_equal(warp(image, lens, lens, (40, 48)), image)
-    got = warp(image, lens, Perspective(30.0, 1.0, center=[28.5, 16.5]), (40, 48))
-    np.testing.assert_allclose(got[5:30, 10:45], image[8:33, 5:40], atol=1e-5)
-
-
-def test_maps_of_many_lenses_are_those_of_each():
-    source = Perspective.from_fov(2.0, 50)
-    many = Spherical.from_fov([0.1, 0.9], 2.0, 30, center=[[29.5, 30.0]] * 2)
-    alone = [warp_map(source, (100, 100), lens, (60, 64)) for lens in many]
-    assert np.array_equal(warp_map(source, (100, 100), many, (60, 64)), np.concatenate(alone))
+def full_size(lens, size, fit):
+    whole = tuple(round(side) for side in lens.image_size[0].tolist())
+    return FullSize(fitted(whole, size, fit).at(lens, whole))
 
 
 # -- at a model's size, and back --------------------------------------------------------------
@@ -115,12 +84,6 @@ def test_a_picture_of_the_size_stays_and_wrong_arguments_are_named():
     assert (same == square).all()
     with pytest.raises(ValueError, match="`fit` must be one of crop, stretch, whole, got 'pad'"):
         at_size(square, Equidistant(9.0, 1.5, image_size=(32, 32)), 32, "pad")
-    with pytest.raises(ValueError, match="needs an image_size"):
-        lens_at_size(Equidistant(30.0, 1.5), 32, "crop")
-    two = Equidistant([20.0, 30.0], math.pi / 2, image_size=(9, 9))
-    for lens in (Equidistant(20.0, math.pi / 2), two):
-        with pytest.raises(ValueError, match="one lens, with the image_size"):
-            FullSize(lens, 9, "crop")
 
 
 WIDE = load(WOODSCAPE)  # its circle is cut by the top and the bottom of 966 × 1280 px
@@ -187,7 +150,7 @@ def test_answers_at_full_size_are_interpolated(size, fit):
     """Logits are interpolated linearly, distances in their logarithm."""
     rng = np.random.default_rng(0)
     small = at_size(np.zeros((*size, 3), np.uint8), all_seen(size), 16, fit)[0].shape[:2]
-    full, inside = FullSize(all_seen(size), 16, fit), part(size, fit)
+    full, inside = full_size(all_seen(size), 16, fit), part(size, fit)
     logits = rng.standard_normal((5, *small)).astype(np.float32)
     labels, expected = full.labels(logits), np.full(size, IGNORE)
     expected[inside] = enlarged(logits, size, fit).argmax(0)
@@ -207,7 +170,7 @@ def test_pixels_beyond_the_lens_have_no_answer(height, width, fit, theta_max):
     lens = KannalaBrandt(
         15.0, (0.01, 0, 0, 0), theta_max, center=(width / 3, height / 2), image_size=(height, width)
     )
-    full, inside = FullSize(lens, 8, fit), part((height, width), fit)
+    full, inside = full_size(lens, 8, fit), part((height, width), fit)
     y, x = np.mgrid[:height, :width]
     radius = np.hypot(x - width / 3, y - height / 2)
     edge = 15 * (theta_max + 0.01 * theta_max**3)
@@ -225,7 +188,7 @@ def test_pixels_beyond_the_lens_have_no_answer(height, width, fit, theta_max):
 
 def test_answers_beyond_the_lens_have_no_part_in_the_others():
     """The distance is 5 m and the class 1 up to the rim, whatever stands beyond it."""
-    full = FullSize(Equidistant(30.0, theta_max=1.5, image_size=(97, 113)), 16, "stretch")
+    full = full_size(Equidistant(30.0, theta_max=1.5, image_size=(97, 113)), 16, "stretch")
     y, x = np.mgrid[:16, :16]
     inside = np.hypot((x - 7.5) * 113 / 16, (y - 7.5) * 97 / 16) <= 45
     distance = np.where(inside, 5, 1e-6).astype(np.float32)
