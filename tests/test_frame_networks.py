@@ -39,7 +39,7 @@ CASES = [
     ("swin", dict(features_only=True, out_indices=1)),
     *((name, dict(task="distance")) for name in FAMILIES if "unet" in name),
     *((name, dict(skip_width=0, places=False, rays=False)) for name in FAMILIES if "unet" in name),
-    ("swin", dict(view="perspective")),
+    ("swin", dict(view=dict(name="perspective", reach=1.4))),
     ("swin_unet", dict(view="square", task="distance")),
     ("swin_unet", dict(view="perspective", places=False)),
     ("darswin_unet_ra", dict(rays=True, num_classes=3)),

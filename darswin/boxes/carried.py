@@ -18,6 +18,7 @@ from darswin.boxes.overlap import clip
 from darswin.boxes.regions import box_of, shown_parts
 
 _COUNT, FINELY = 72, 288  # points of an ellipse, and of one that is cut
+_BETWEEN = 33  # points at which the end of a curve is looked for
 
 
 def _shares(count: int) -> np.ndarray:
@@ -43,7 +44,7 @@ def carry(
 
     Args:
         boxes: (K, 4).
-        points_map: called once with points (K, 72, 2), and more often if boxes are cut.
+        points_map: called twice for all boxes, and more often if boxes are cut.
         size: (H, W) of the new picture. Without it, boxes may go on beyond the picture.
 
     Returns:
@@ -56,11 +57,13 @@ def carry(
     table = table_of(boxes)
     # Reductions along a contiguous axis are several times as fast.
     x, y = np.ascontiguousarray(np.moveaxis(through(points_map, ellipses(table)), -1, 0))
-    carried = np.stack((_least(x), _least(y), -_least(-x), -_least(-y)), 1) if len(table) else table
+    carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1) if len(table) else table
     whole = ~np.isnan(carried[:, 0])
     if size is not None:
         whole &= (clip(carried, size) == carried).all(1)
         whole &= (np.abs(np.diff(x, append=x[:, :1])) <= size[1] / 2).all(1)  # not at a seam
+    if whole.any():
+        carried[whole] = _ends(table[whole], points_map, x[whole], y[whole])
     visible = np.ones(len(table))
     cut = np.flatnonzero(~whole)
     outlines = [*ellipses(table[cut], FINELY)]
@@ -70,14 +73,29 @@ def carry(
     return like(boxes, carried), like(boxes, visible)
 
 
+def _ends(table: np.ndarray, points_map: PointMap, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The boxes of curves whose points are x and y (K, P): each of the four ends is looked for
+    between the neighbours of the outermost point, since a curve may have corners."""
+    outermost = np.stack((x, y, -x, -y)).argmin(2)  # (4, K)
+    around = outermost[..., None] + np.linspace(-1, 1, _BETWEEN)
+    angle = 2 * np.pi / x.shape[1] * around
+    middle, half = (table[:, :2] + table[:, 2:]) / 2, (table[:, 2:] - table[:, :2]) / 2
+    circle = np.stack((np.cos(angle), np.sin(angle)), -1)
+    found = through(points_map, middle[:, None] + half[:, None] * circle)
+    x, y = np.moveaxis(np.where(np.isnan(found), np.inf, found), -1, 0)
+    x_high, y_high = np.moveaxis(np.where(np.isnan(found), -np.inf, found), -1, 0)
+    return np.stack((_least(x[0]), _least(y[1]), -_least(-x_high[2]), -_least(-y_high[3])), 1)
+
+
 def _least(values: np.ndarray) -> np.ndarray:
-    """The least value of closed smooth curves (K, P), between the points too: that of the parabola
-    through the least one and its neighbours."""
-    row, k = np.arange(len(values)), values.argmin(1)
-    last, least, ahead = (values[row, (k + step) % values.shape[1]] for step in (-1, 0, 1))
+    """The least value of curves (K, P), between the points too: that of the parabola through the
+    least one and its neighbours."""
+    row, k = np.arange(len(values)), values.argmin(1).clip(1, values.shape[1] - 2)
+    last, least, ahead = (values[row, k + step] for step in (-1, 0, 1))
     bend = last - 2 * least + ahead
     below = np.divide((ahead - last) ** 2, 8 * bend, out=np.zeros(len(row)), where=bend > 0)
-    return least - np.where(below < 0.01 * (values.max(1) - least), below, 0)  # 0 at a seam
+    best = np.minimum(np.minimum(last, ahead), least)
+    return np.where(below < 0.1 * (values.max(1) - best), least - below, best)  # not at a seam
 
 
 def ellipses(boxes: Array, count: int = _COUNT) -> np.ndarray:

@@ -151,7 +151,7 @@ class _Maps:
         self.remap = view.at(seen, picture_size(lens))
         self.said = json.dumps(to_dict(seen))
 
-    def pictures(self, image: np.ndarray) -> Sequence[np.ndarray]:
+    def pictures(self, image: np.ndarray) -> np.ndarray:
         return self.remap(image).reshape(len(self.remap.tiles), *self.remap.view_size, -1)
 
 

@@ -15,7 +15,8 @@ def load_timm_swin(source: Source, **options) -> Swin:
     """timm's `SwinTransformer` from its state dict, in eval mode and with the same outputs.
 
     Args:
-        source: a state dict or the path of its file; see `read_state`.
+        source: a state dict, or the path of its file: safetensors, or what `torch.save` wrote, of
+            which no code is executed.
         options: constructor arguments that cannot be read from the state dict: `image_size`, if it
             is not 64.
 
@@ -39,7 +40,8 @@ def load_dat(source: Source, **options) -> DAT:
     The later models of the released code, DAT++, have other layers and are refused.
 
     Args:
-        source: a state dict or the path of its file; see `read_state`.
+        source: a state dict, or the path of its file: safetensors, or what `torch.save` wrote, of
+            which no code is executed.
         options: constructor arguments that cannot be read from the state dict: `offset_range`, if
             it is not 2; and `image_size`, if it is not 64 and no block is deformable.
 

@@ -239,7 +239,8 @@ def load_official(source: Source, **options) -> DarSwin:
     images, or `OfficialPolynomial(coefficients, radius)`.
 
     Args:
-        source: a state dict or the path of its file; see `read_state`.
+        source: a state dict, or the path of its file: safetensors, or what `torch.save` wrote, of
+            which no code is executed.
         options: constructor arguments that cannot be read from the state dict: `rings`, `sectors`,
             `samples` and `in_chans`, if they differ from 16, 64, (10, 10) and 3.
 

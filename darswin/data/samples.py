@@ -20,7 +20,7 @@ from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, Header, read_header
 from darswin.utils.parameters import check
 from darswin.utils.tasks import Fit
-from darswin.views import CameraView, CropView, PixelView
+from darswin.views import CameraView, CropView
 from darswin.views.camera import picture_size
 from darswin.views.turn import STILL, Turn
 
@@ -148,7 +148,7 @@ class Samples(Dataset):
         sample = self._read(draw)
         return sample.through(self._view(sample.lens, draw))
 
-    def _view(self, own: Lens, draw: Draw) -> PixelView:
+    def _view(self, own: Lens, draw: Draw) -> CameraView | CropView:
         """What a sample shows of a picture of the lens `own`."""
         turn, crop = self._turn(draw), self._crop(draw)
         if self.lens_augmentation is not None:
@@ -236,7 +236,7 @@ class Calibrated(Samples):
 
     Raises:
         ValueError: a picture without a lens, or with another aspect ratio than its calibration.
-        BrokenImageError: from `dataset[i]`, for a file that cannot be read.
+        OSError: from `dataset[i]`, for a file that cannot be read.
     """
 
     source: Source

@@ -15,7 +15,7 @@ from darswin.lens import Lens, Perspective
 from darswin.utils.angles import degrees_hint
 from darswin.utils.resize import area_resized
 from darswin.utils.tasks import Fit
-from darswin.views import CameraView, CropView, PixelView
+from darswin.views import CameraView, CropView
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
@@ -74,7 +74,7 @@ class WideAngle(Samples):
         # A turn leaves the lens as it is, which is round and in the middle.
         return sample.through(CameraView(self._first_lens(draw), turn=self._turn(draw), reads=1))
 
-    def _view(self, own: Lens, draw: Draw) -> PixelView:
+    def _view(self, own: Lens, draw: Draw) -> CameraView | CropView:
         if self.lens_augmentation is not None:
             return CameraView(self._other_lens(draw, own))
         return CropView((0, 0, self.render, self.render), (self.size, self.size))

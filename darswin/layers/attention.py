@@ -18,7 +18,7 @@ from darswin.ops import window_attention
 from darswin.ops.checks import check_pair
 from darswin.views import PolarGrid
 
-__all__ = ["PolarWindowAttention"]
+__all__ = ["PolarWindowAttention", "WindowAttention"]
 
 
 class WindowAttention(nn.Module):

@@ -189,7 +189,8 @@ def _fractions(lens: Lens, count: int) -> Tensor:
 
 
 def cat(lenses: Sequence[Lens]) -> Lens:
-    """Joins lenses to one batch. Lenses of several models become curves (see `as_curves`).
+    """Joins lenses to one batch. Lenses of several models become `Tabulated` lenses of 512 angles,
+    which in float64 reproduce them to 1e-7 of `r_max`.
 
     Raises:
         ValueError: no lens; a principal point or an image size for only some lenses; or several

@@ -7,6 +7,7 @@ from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps
+from darswin.models.features import FeatureInfo
 from darswin.models.registry import list_models
 from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.models.swin import Swin
@@ -17,6 +18,7 @@ __all__ = [
     "ConvUnet",
     "DarSwin",
     "Encoder",
+    "FeatureInfo",
     "FeatureMaps",
     "LensAdapter",
     "Model",

@@ -328,7 +328,8 @@ class Model(nn.Module, Generic[Result]):
         """Chooses the library that computes the matrix products of the linear layers.
 
         Args:
-            matmul_backend: "torch" or "onednn"; see `Linear`.
+            matmul_backend: "torch" or "onednn", which applies to float32 on the CPU in eager mode.
+                The two round differently. Second derivatives need "torch".
 
         Raises:
             ValueError: the backend is unknown.

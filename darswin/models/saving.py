@@ -111,7 +111,7 @@ def read_card(path: str | os.PathLike) -> ModelCard:
     """The card of a model file, read without the weights.
 
     Args:
-        path: the path of the file, or a name from `list_pretrained()`.
+        path: the path of the file, or the name of a trained model, which `darswin models` lists.
 
     Raises:
         NoCardError: the file has no card.
@@ -131,12 +131,11 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     """The model from a file, in eval mode, and its card.
 
     Args:
-        path: the path of the file, or a name from `list_pretrained()`.
+        path: the path of the file, or the name of a trained model, which `darswin models` lists.
 
     Raises:
-        NoCardError: the file has no card.
-        ValueError: the file is no safetensors file or is damaged, its card is wrong, or the weights
-            do not fit the model of the card.
+        ValueError: the file is no safetensors file or is damaged, it has no card or a wrong one, or
+            the weights do not fit the model of the card.
     """
     path = model_file(path)
     weights, metadata = read_tensors(path)

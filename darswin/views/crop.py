@@ -118,7 +118,8 @@ class CropView(PixelView):
             return remap.sampled(picture)
         top, left, height, width = self.part
         if self.turn.angle:
-            onto = CropView(self.part, (height, width), self.turn)._matrix(remap.lens, remap.size)
+            whole = CropView(self.part, (height, width), self.turn)
+            onto = whole._matrix(remap.some_lens, remap.size)
             found = area_resized(cv2.warpAffine(picture, onto, (width, height)), self.size)
         else:
             if self.turn.mirrored:

@@ -259,8 +259,8 @@ class Remap:
             target: (H, W), of the picture.
 
         Returns:
-            (H', W'), of the same dtype. Where the view shows nothing, it is `IGNORE` (255) in
-            uint8, and 0 in others.
+            (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where
+            the view shows nothing.
         """
         x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
         height, width = self.size

@@ -63,6 +63,7 @@ class TilesView(PixelView):
     """
 
     size: Pair
+    tiles: Sequence[StereographicView]
 
     def __init__(
         self,

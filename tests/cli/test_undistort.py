@@ -233,7 +233,7 @@ def test_folders_are_undistorted_and_what_is_broken_is_named(mixed, capsys):
     for name, size in (("large.bmp", (192, 256)), ("front/a.png", SIZE), ("clip.mkv", SIZE)):
         camera = cameras.lens_of(out / name, size)
         assert math.isclose(
-            camera.focal.item(), size[1] / 2 / math.tan(math.radians(55)), rel_tol=1e-5
+            camera.focal.item(), size[1] / 2 / math.tan(math.radians(50)), rel_tol=1e-5
         )
 
 

@@ -177,7 +177,7 @@ def test_tiles_and_squares():
     assert shown.shape == (4, 32, 40, 3)
     for one, tile in zip(shown, tiles.tiles, strict=True):
         np.testing.assert_array_equal(one, undistort(image, lens, tile))
-    square = SquareView((50, 50), theta_max=1.5)
+    square = SquareView((50, 50), fov=3.0)
     seen = square(torch.from_numpy(image)[None].movedim(-1, 1).double(), lens)[0]
     found = undistort(image, lens, square)
     np.testing.assert_allclose(found, seen.movedim(0, -1), atol=0.05)

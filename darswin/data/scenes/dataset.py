@@ -31,7 +31,7 @@ class SceneSamples(Samples):
 
     Raises:
         ValueError: a share out of range; from `dataset[i]`, as for `Scenes`.
-        BrokenImageError: from `dataset[i]`, for a file that cannot be read.
+        OSError: from `dataset[i]`, for a file that cannot be read.
     """
 
     def __init__(self, scenes: Scenes, *, crop: float | None = None, **options: Any):

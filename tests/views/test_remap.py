@@ -1,0 +1,258 @@
+"""Every view of every kind of lens is one map: its points, boxes, labels and pictures agree.
+
+The oracle is a loop over the pixels of the view, by `to_rays` and the lens alone.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import product
+from hypothesis import given
+from hypothesis import strategies as st
+
+from darswin import boxes as of_boxes
+from darswin.data.labels.labels import Thing, move_things
+from darswin.frames import Sampler
+from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Spherical
+from darswin.models import LensAdapter
+from darswin.views import CameraView, CropView, Turn, list_views, make_view
+
+SIZE = (90, 120)
+LENSES = {
+    "circle": Equidistant(36.0, 1.2, center=[57.0, 46.0], image_size=SIZE),
+    "cut": KannalaBrandt(60.0, [0.01, -0.004], 1.5, center=[61.0, 43.0], image_size=SIZE),
+    "oblong": Spherical(0.7, 60.0, 1.4, [58.0, 45.0], affine=[[1, 0.04], [0, 0.85]],
+                        image_size=SIZE),
+    "tangential": BrownConrady(70.0, [0.02], 0.8, [60.0, 44.0], tangential=[0.01, -0.02],
+                               image_size=SIZE),
+}  # fmt: skip
+OTHER = Spherical.from_fov(0.5, 2.2, 30.0, center=[29.5, 31.0], image_size=(64, 60))
+SHEARED = KannalaBrandt(25.0, [0.02], 1.1, affine=[[1, 0.1], [0, 0.9]], image_size=(50, 60))
+
+
+def view_of(name, size=(40, 40), **options):
+    own = {
+        "camera": lambda: CameraView(OTHER, turn=Turn(0.4, True), **options),
+        "camera of another kind": lambda: CameraView(SHEARED, **options),
+        "crop": lambda: CropView((10, 20, 71, 83), (34, 45)),
+        "turned crop": lambda: CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
+        "none": lambda: make_view("none", SIZE),
+    }
+    if name in own:
+        return own[name]()
+    return make_view(name, size, **options)
+
+
+VIEWS = [*sorted(set(list_views()) - {"polar"}), "camera", "camera of another kind", "crop",
+         "turned crop"]  # fmt: skip
+pairs = pytest.mark.parametrize(("name", "kind"), product(VIEWS, LENSES))
+
+
+def by_loops(remap, reads=1):
+    """The points of the picture that the pixels of a view show, (k·H', k·W', 2), from rays."""
+    height, width = remap.view_size
+    y, x = ((np.arange(side * reads) + 0.5) / reads - 0.5 for side in (height, width))
+    grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
+    if isinstance(remap.view, CropView) or not remap.view.uses_lens:
+        return remap.view.to_image(grid, remap.lens, remap.size)[0].numpy()
+    rays = remap.view.to_rays(grid, remap.lens, remap.size)
+    return remap.lens.project_points(rays, remap.size)[0].numpy()
+
+
+def read(picture, points):
+    """Bilinear, with 0 outside."""
+    height, width = picture.shape[:2]
+    padded = np.zeros((height + 2, width + 2, picture.shape[2]))
+    padded[1:-1, 1:-1] = picture
+    x, y = np.moveaxis(points, -1, 0) + 1
+    inside = (x > 0) & (x < width + 1) & (y > 0) & (y < height + 1)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    i, j = np.floor(y).astype(int).clip(0, height), np.floor(x).astype(int).clip(0, width)
+    a, b = (y - i)[..., None], (x - j)[..., None]
+    found = (1 - a) * ((1 - b) * padded[i, j] + b * padded[i, j + 1])
+    found += a * ((1 - b) * padded[i + 1, j] + b * padded[i + 1, j + 1])
+    return np.where(inside[..., None], found, 0)
+
+
+@pairs
+def test_points_and_their_inverse(name, kind):
+    lens = LENSES[kind]
+    for remap in view_of(name).at(lens, SIZE).tiles:
+        points = by_loops(remap)
+        sides = np.array(SIZE[::-1])
+        inside = ((points >= -0.499) & (points <= sides - 0.501)).all(-1)
+        y, x = np.mgrid[: remap.view_size[0], : remap.view_size[1]]
+        pixels = np.stack((x, y), -1).astype(float)
+        found = remap.to_image(pixels)
+        np.testing.assert_allclose(found[inside], points[inside], atol=1e-4)
+        outside = ~((points >= -0.502) & (points <= sides - 0.498)).all(-1)
+        assert np.isnan(found[outside]).all()
+        back = remap.to_view(found[inside])
+        known = ~np.isnan(back).any(-1)  # all but the rim
+        np.testing.assert_allclose(back[known], pixels[inside][known], atol=2e-3)
+        assert known.mean() > 0.98 or not inside.any()
+        as_tensors = remap.to_image(torch.from_numpy(pixels))
+        np.testing.assert_array_equal(as_tensors.numpy(), found)
+
+
+@pairs
+def test_pictures_are_those_of_loops_the_sampler_and_torch(name, kind):
+    lens, view = LENSES[kind], view_of(name)
+    remap = view.at(lens, SIZE)
+    picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
+    reads = remap.points.shape[1] // remap.view_size[1]
+    expected = np.stack([
+        read(picture, by_loops(tile, reads))
+        .reshape(tile.view_size[0], reads, tile.view_size[1], reads, 3).mean((1, 3))
+        for tile in remap.tiles
+    ])  # fmt: skip
+    sampled = remap.sampler()(picture).reshape(expected.shape)
+    assert sampled.dtype == np.uint8
+    rim = 1.5 if "camera" not in name else 60  # tables of the radius end at the rim
+    error = np.abs(sampled - expected)
+    assert error.max() <= rim and np.quantile(error, 0.99) <= 1.5
+    found = remap.sampled(picture)
+    assert found.shape == ((view.count,) if view.count > 1 else ()) + (*remap.view_size, 3)
+    assert np.abs(found.reshape(expected.shape).astype(int) - sampled).max() <= 1
+    planes = torch.from_numpy(picture).permute(2, 0, 1)[None].double().requires_grad_()
+    seen = remap(planes)
+    assert seen.shape == (view.count, 3, *remap.view_size)
+    error = np.abs(seen.detach().permute(0, 2, 3, 1).numpy() - expected)
+    assert error.max() <= rim and np.quantile(error, 0.99) < 0.5
+    seen.sum().backward()
+    assert planes.grad.abs().sum() > 0
+    grey = remap(picture[..., 0])
+    np.testing.assert_array_equal(grey, remap(picture[..., :1])[..., 0])
+    exact = remap(picture[..., :2].astype(np.float32))
+    assert exact.dtype == np.float32 and np.abs(exact - remap(picture)[..., :2]).max() <= 1.01
+
+
+@pairs
+def test_a_uniform_picture_stays_uniform_inside_and_is_black_outside(name, kind):
+    remap = view_of(name).at(LENSES[kind], SIZE)
+    found = remap(np.full((*SIZE, 1), 200, np.uint8)).reshape(-1, *remap.view_size)
+    for picture, tile in zip(found, remap.tiles, strict=True):
+        points = by_loops(tile)
+        known = ~np.isnan(points).any(-1)
+        inner = known & ((points >= 4) & (points <= np.array(SIZE[::-1]) - 5)).all(-1)
+        # Not beside what the lens does not show.
+        inner[1:-1, 1:-1] &= known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
+        inner[[0, -1]] = inner[:, [0, -1]] = False
+        assert (picture[inner] == 200).all()
+        far = known & ((points < -15) | (points > np.array(SIZE[::-1]) + 14)).any(-1)
+        assert not picture[far].any()
+
+
+@pairs
+def test_targets_take_the_nearest_value(name, kind):
+    remap = view_of(name).at(LENSES[kind], SIZE)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    for tile in remap.tiles:
+        points = by_loops(tile)
+        column, row = (np.asarray(tile.target(values)) for values in
+                       (x.astype(np.uint8), y.astype(np.float32) + 1))  # fmt: skip
+        assert column.dtype == np.uint8 and row.dtype == np.float32
+        near = np.abs(points - np.floor(points) - 0.5) > 0.02  # not halfway between two pixels
+        inside = ((points > -0.48) & (points < np.array(SIZE[::-1]) - 0.52)).all(-1)
+        inside &= near.all(-1) & (row > 0)
+        np.testing.assert_array_equal(column[inside], np.rint(points[inside, 0]))
+        np.testing.assert_array_equal(row[inside], np.rint(points[inside, 1]) + 1)
+        outside = ~((points > -0.52) & (points < np.array(SIZE[::-1]) - 0.48)).all(-1)
+        assert (column[outside] == 255).all() and not row[outside].any()
+        assert inside.any() or name == "tiles"
+
+
+@pairs
+def test_one_box_has_one_answer(name, kind):
+    """The box of a thing, by `boxes_to_image`, a `LensAdapter`, and 100,000 points of its ellipse;
+    and back into the view, as `darswin warp` moves it."""
+    lens, view = LENSES[kind], view_of(name)
+    remap = view.at(lens, SIZE)
+    table = np.array([[6.0, 8, 22, 19], [-4, 5, 12, 30], [25, 20, 60, 60], [9, 9, 9, 12]])
+    angle = np.linspace(0, 2 * math.pi, 100_000, endpoint=False)
+    circle = np.stack((np.cos(angle), np.sin(angle)), -1)
+    for tile in remap.tiles:
+        found = tile.boxes_to_image(table)
+        again = tile.boxes_to_image(torch.from_numpy(table).float())
+        np.testing.assert_allclose(again.boxes, found.boxes, rtol=0, atol=1e-4)
+        assert found.visible[3] == 0 and np.isnan(found.boxes[3]).all()
+        for box, moved, share in zip(of_boxes.clip(table, tile.view_size), *found[:2], strict=True):
+            middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2
+            points = tile.to_image(middle + half * circle - 0.5) + 0.5
+            if np.isfinite(points).all() and share == 1:
+                exact = np.concatenate((points.min(0), points.max(0)))
+                np.testing.assert_allclose(moved, exact, atol=0.02)
+    if view.count > 1:
+        return
+
+    class Finds(torch.nn.Module):
+        def forward(self, x):
+            boxes = torch.from_numpy(table).float()
+            return dict(boxes=boxes, scores=torch.ones(4), labels=torch.zeros(4).long())
+
+    (by_adapter,) = LensAdapter(Finds(), view=view)(torch.zeros(1, 3, *SIZE), lens)
+    seen = found.visible > 0
+    np.testing.assert_allclose(by_adapter["boxes"], found.boxes[seen], atol=0.02)
+    np.testing.assert_allclose(by_adapter["visible"], found.visible[seen], atol=1e-3)
+    if view.uses_lens:
+        rays = remap.rays((table[:3, :2] + table[:3, 2:] - 1) / 2)
+        np.testing.assert_allclose(found.rays[0], np.nan_to_num(rays[0]), atol=1e-6)
+    inner = np.array([[50.0, 40, 66, 52]])
+    there, visible, _ = remap.boxes_to_view(inner)
+    (thing,) = move_things([Thing(1, inner[0])], remap)
+    np.testing.assert_allclose(thing.box, there[0], atol=0.02)
+    assert thing.visible == pytest.approx(visible[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", sorted(set(list_views()) - {"polar", "none"}))
+@given(st.data())
+def test_any_sizes_from_one_pixel_up(name, data):
+    side = st.integers(1, 9)
+    size = data.draw(st.tuples(side, side))
+    shape = data.draw(side.map(lambda s: (s, s)) if name == "square" else st.tuples(side, side))
+    lens = Equidistant(max(size) / 2.0, 1.2, image_size=size)
+    remap = make_view(name, shape).at(lens, size)
+    channels = data.draw(st.integers(1, 4))
+    picture = np.full((*size, channels), 9, np.uint8)
+    try:
+        found = remap(picture)
+    except ValueError as error:  # one pixel may show none of those of the picture
+        assert "sees nothing of the lens" in str(error)
+        return
+    assert found.shape[-3:] == (*shape, channels) and found.max() <= 9
+    for tile in remap.tiles:
+        assert tile.target(picture[..., 0]).shape == shape
+        assert tile.boxes_to_image(np.zeros((0, 4))).boxes.shape == (0, 4)
+        assert tile.to_view(np.zeros((0, 2))).shape == (0, 2)
+    assert remap.shown.shape == size
+    assert remap.back(np.ones((view_count(remap), 2, *shape), np.float32)).shape == (2, *size)
+
+
+def view_count(remap):
+    return len(remap.tiles)
+
+
+def test_a_remap_is_of_one_lens_and_one_size():
+    view = make_view("mercator", (8, 8))
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        view.at(Equidistant([9.0, 9.0], 1.2), SIZE)
+    with pytest.raises(TypeError, match=r"lens must be a darswin.lens.Lens, got NoneType"):
+        view.at(None, SIZE)
+    remap = view.at(LENSES["cut"], SIZE)
+    with pytest.raises(ValueError, match=r"the picture must be \(H, W\) = \(90, 120\)"):
+        remap(np.zeros((9, 9), np.uint8))
+    with pytest.raises(TypeError, match="rays need the lens"):
+        make_view("none", None).at(None, SIZE).rays(np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="mean and the std"):
+        make_view("mercator", (8, 8), mean=None, std=None).at(LENSES["cut"], SIZE).plan("image")
+
+
+def test_a_plan_normalizes_as_the_view_says():
+    view = make_view("mercator", (16, 20), mean=[0.5, 0.4, 0.3], std=[0.2, 0.3, 0.4])
+    remap = view.at(LENSES["cut"], SIZE)
+    picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
+    found = Sampler(remap.plan("image"))(picture)
+    planes = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    np.testing.assert_allclose(found, remap(planes)[0], atol=2e-5)
