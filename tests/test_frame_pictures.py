@@ -93,11 +93,11 @@ def test_points_of_a_plan_are_those_of_the_lens(name, reads):
     view = make_view(name, (200, 240) if name != "square" else (200, 200), mean=0, std=1, **options)
     plan, exact = camera.plan(view, LENS, SIZE), LENS.to(torch.float64)
     points = np.random.default_rng(0).uniform(-0.5, 199.5, (500, 2))
-    for tile in range(view.count):
+    for tile, remap in enumerate(view.at(exact, SIZE).tiles):
         of_tile = dict(tile=tile) if view.count > 1 else {}
         found, expected = (
             plan.points(points, **of_tile),
-            view.to_image(points, exact, SIZE, **of_tile),
+            remap.to_image(points),
         )
         seen = ~np.isnan(found + expected).any(-1)  # a plan ends within a pixel of the border
         inside = ((expected > 1) & (expected < [158, 118])).all(-1)

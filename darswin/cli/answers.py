@@ -1,11 +1,9 @@
 """Predictions for a stream of images: classes, or files with labels or distances."""
 
 import io
-import json
-import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,14 +13,15 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from darswin.cli.arguments import can_write
+from darswin.cli.pictures import ByLens
 from darswin.data.framing import CutOff, FullSize, cut_off, fitted
 from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
-from darswin.models.base import Model, Prepared
+from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
+from darswin.models.prepared import Prepared
 from darswin.models.saving import ModelCard
 from darswin.ops import _module
 from darswin.utils.files import replace_file
@@ -42,7 +41,6 @@ from darswin.viz.pixels import (
 Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # takes a half to a third of the time of single images
-ANSWERS = "predictions.json"
 TOP = 5  # classes of a picture that are listed
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
@@ -65,7 +63,7 @@ class Answers:
         self.channels = channels
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0  # spent in the network
-        self._kept: dict[int, tuple[Lens, Any]] = {}  # by the identity of the lens
+        self._by_lens = ByLens(self.most_lenses)
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         """Adds an image (H, W, C) uint8 with its lens. Equal lenses should be the same object."""
@@ -77,15 +75,6 @@ class Answers:
     def finish(self) -> str | None:
         """What is wrong with all answers, once they are there."""
         return None
-
-    def _once(self, lens: Lens, make: Callable[[], Any]) -> Any:
-        """What `make` makes of a lens, made once for each of the last lenses."""
-        if id(lens) not in self._kept:
-            made = make()
-            if len(self._kept) == self.most_lenses:
-                del self._kept[next(iter(self._kept))]
-            self._kept[id(lens)] = lens, made
-        return self._kept[id(lens)][1]
 
 
 class Seen(NamedTuple):
@@ -114,7 +103,7 @@ class ModelAnswers(Answers):
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         if lens is not self._lens:
             self.flush()
-            self._seen: Seen = self._once(lens, lambda: self._seen_by(lens))
+            self._seen: Seen = self._by_lens(lens, lambda: self._seen_by(lens))
             self._lens = lens
         pixels = torch.from_numpy(self._seen.remap(image)[None]).permute(0, 3, 1, 2).contiguous()
         self._queue.append(Request(entry, image, pixels))
@@ -334,45 +323,3 @@ def distance_png(distance: np.ndarray) -> memoryview:
     steps = np.rint(np.where(known, distance, 0) * PER_METRE).clip(known, FARTHEST)
     _, png = cv2.imencode(".png", steps.astype(np.uint16))
     return png.data
-
-
-def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
-    """The names of output files for pictures and videos: their paths relative to the common folder
-    of all arguments, without the endings of pictures unless two names would become equal."""
-    whole = relative_names(paths, files)
-    videos = {name for name, is_video in files if is_video}
-    short = {n: w if n in videos else os.path.splitext(w)[0] for n, w in whole.items()}
-    return short if len(set(short.values())) == len(set(whole.values())) else whole
-
-
-def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
-    """The paths of pictures and videos relative to the common folder of all arguments."""
-    folders = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
-    root = os.path.commonpath(folders)
-    return {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
-
-
-def claim_folder(out: str | None, record: str = ANSWERS) -> Path:
-    """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
-    which left the file `record` there."""
-    if out is None:
-        raise ValueError("missing --out: this model writes pictures; give a folder for them")
-    folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
-    if not can_write(folder.absolute()):
-        raise ValueError(f"--out must be a folder that can be written, got {out}")
-    if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
-        raise ValueError(
-            f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "
-            "run of this command, whose files are replaced"
-        )
-    replace_file(folder / record, "[]")
-    return folder
-
-
-def _is_ours(file: Path) -> bool:
-    try:
-        return isinstance(json.loads(file.read_bytes()), list)
-    except (OSError, ValueError):
-        return False

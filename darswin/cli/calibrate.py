@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from darswin.calibrate import Board, CalibratedLens
+    from darswin.cli.pictures import Broken
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 Kind = Literal["chessboard", "charuco", "april"]
@@ -65,8 +66,7 @@ def calibrate(
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
-    from darswin.cli.predict import check_paths, pictures_and_videos
-    from darswin.utils.image import BrokenImageError
+    from darswin.cli.pictures import check_paths, pictures_and_videos
     from darswin.utils.progress import Progress
 
     made = _board(kind, board, square, marker=marker, gap=gap, dictionary=dictionary)
@@ -93,7 +93,7 @@ def calibrate(
     if len(seen.names) < LEAST:
         few = f"{len(seen.names)} of {seen.total} pictures show the board of --board {board}"
         why = "; ".join([f"{few}: {LEAST} are needed, and 10 to 20 are better", *seen.doubts])
-        raise ValueError("\n".join([why, *seen.bad]))
+        raise ValueError("\n".join([why, *seen.broken.errors]))
     with Progress("calibrate") as progress:
         found = found_by(
             seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
@@ -118,8 +118,7 @@ def calibrate(
         entries["doubts"] = seen.doubts + found.doubts
         replace_file(report, json.dumps(entries, indent=1))
         print(report)
-    if seen.bad:
-        raise BrokenImageError("\n".join(seen.bad))
+    seen.broken.report()
 
 
 def check_lens_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
@@ -173,7 +172,7 @@ class _Seen(NamedTuple):
     without: list[str]
     brightest: "np.ndarray"
     doubts: list[str]
-    bad: list[str]
+    broken: "Broken"
 
     @property
     def total(self) -> int:
@@ -185,18 +184,19 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
 
     from darswin.calibrate import find_corners
     from darswin.calibrate.boards import edge_width, shown_instead
-    from darswin.utils.image import BrokenImageError, as_stored, read_oriented
+    from darswin.cli.pictures import Broken
+    from darswin.utils.image import as_stored, read_oriented
 
     corners: dict[str, np.ndarray] = {}
     widths: dict[str, float] = {}
     without: dict[str, str] = {}  # the board, and what they show instead
     known: dict[int, str] = {}
-    first, brightest, doubts, bad = "", np.zeros((1, 1, 1), np.uint8), [], []
+    first, brightest, doubts, broken = "", np.zeros((1, 1, 1), np.uint8), [], Broken()
     for progress.done, name in enumerate(files):
-        try:
+        image = None
+        with broken.skipped():
             image = as_stored(*(read := read_oriented(name, 1)))
-        except BrokenImageError as error:
-            bad.append(with_flags(error))
+        if image is None:
             continue
         if not known:
             first, brightest = name, np.zeros_like(image)
@@ -232,7 +232,7 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
     found = np.array([*corners.values()])
-    return _Seen([*corners], found, [*without], brightest, doubts, bad)
+    return _Seen([*corners], found, [*without], brightest, doubts, broken)
 
 
 def _listed(names: Collection[str]) -> str:

@@ -30,7 +30,7 @@ def estimate(
     """
     # These import OpenCV and Pillow, which other commands of `lens` do not need.
     from darswin.calibrate import estimate as estimate_lens
-    from darswin.cli.predict import check_paths, pictures_and_videos
+    from darswin.cli.pictures import check_paths, pictures_and_videos
     from darswin.utils.image import read_stored
 
     if not pictures:

@@ -155,7 +155,7 @@ class NetworkAnswers(Answers):
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         try:
-            seen: Seen = self._once(lens, lambda: self._seen(image.shape[:2], lens))
+            seen: Seen = self._by_lens(lens, lambda: self._seen(image.shape[:2], lens))
         except ValueError as error:
             raise BrokenImageError(f"{said(entry)} has no such view: {error}") from error
         pictures = seen.sampler(image[..., :: self._step])

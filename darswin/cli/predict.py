@@ -1,47 +1,44 @@
 """`darswin predict`: predictions of a trained model for pictures and videos of known lenses."""
 
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from darswin.cli.answers import (
-    ANSWERS,
     ANSWERS_OF,
     TOP,
     Answers,
     ClassAnswers,
-    claim_folder,
-    file_names,
 )
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
 from darswin.cli.options import check_folder
+from darswin.cli.pictures import (
+    Broken,
+    check_paths,
+    claim_folder,
+    file_names,
+    pictures_and_videos,
+)
 from darswin.compat import load_official
-from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
-from darswin.utils.files import check_is_file, replace_file
+from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
-from darswin.utils.parameters import check, naming, with_flags
+from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
-from darswin.utils.video import is_video, read_frames
+from darswin.utils.video import read_frames
 
-
-class File(NamedTuple):
-    """A picture or a video to predict."""
-
-    name: str
-    is_video: bool
+ANSWERS = "predictions.json"
 
 
 def predict(
@@ -161,21 +158,19 @@ def predict(
     else:
         assert run is not None
         lenses = lenses_of_run(run, camera, coefficients, names)
-    folder = None if prints else claim_folder(out)
+    folder = None if prints else claim_folder(out, ANSWERS)
     out = out if folder is None else str(folder / ANSWERS)
     answers = make(folder, file_names(paths, files))
-    bad: list[str] = []
+    broken = Broken()
     try:
         for file in files:
-            try:
+            with broken.skipped():
                 if file.is_video:
                     answer_video(file.name, every, lenses, answers)
                 else:
                     image, orientation = read_oriented(file.name, answers.channels)
                     taken_with = _lens(lenses, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
-            except BrokenImageError as error:
-                bad.append(with_flags(error))
     finally:  # keep the predictions so far
         try:
             answers.flush()
@@ -185,12 +180,11 @@ def predict(
                 text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
                 print(text) if out is None else replace_file(out, text)
     if (wrong := answers.finish()) is not None:
-        raise ValueError("\n".join([wrong, *bad]))
-    if bad:
-        videos = any(file.is_video for file in files)
-        what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
-        count = f"no {what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
-        raise BrokenImageError(count + "\n".join(bad))
+        raise ValueError("\n".join([wrong, *broken.errors]))
+    videos = any(file.is_video for file in files)
+    what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
+    count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
+    broken.report(count if found else "")
     return found
 
 
@@ -206,36 +200,6 @@ def _of_model(
         return ANSWERS_OF[card.task](net, card, folder, names)
 
     return card.task, make
-
-
-def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
-    """The files at the paths; a folder stands for all pictures and videos in it."""
-    files = []
-    for path in paths:
-        names = [str(path)]
-        if os.path.isdir(path) and not _is_picture(path):
-            below = pictures_and_videos_below(Path(path))
-            names = [n for n in below if leave_out is None or not is_below(n, leave_out)]
-            for name in names:
-                check_is_file(name)
-        files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
-    return files
-
-
-def check_paths(paths: Sequence[str]) -> None:
-    """FileNotFoundError that lists all missing files; ValueError for pipes, devices and sockets."""
-    if missing := [path for path in paths if not os.path.exists(path)]:
-        raise FileNotFoundError(f"there is no file or folder {', '.join(missing)}")
-    for path in paths:
-        check_is_file(path)
-
-
-def _is_picture(path: str) -> bool:
-    return os.path.splitext(path)[1].lower() in PICTURES
-
-
-def is_below(path: str, folder: str) -> bool:
-    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> None:

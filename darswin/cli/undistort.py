@@ -20,12 +20,12 @@ from darswin.utils.parameters import check, with_flags
 if TYPE_CHECKING:
     import numpy as np
 
+    from darswin.cli.pictures import Broken
     from darswin.data.cameras import Calibrations
     from darswin.frames import Sampler
 
 MOST_PIXELS = 2**26  # of a view
 RECORD, LENS = "undistorted.json", "lens.json"
-_KEPT = 8  # plans in memory, for pictures of several sizes or cameras
 
 
 def undistort(
@@ -72,10 +72,15 @@ def undistort(
         coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
-    from darswin.cli.answers import claim_folder, relative_names
-    from darswin.cli.predict import check_paths, is_below, pictures_and_videos
+    from darswin.cli.pictures import (
+        Broken,
+        check_paths,
+        claim_folder,
+        is_below,
+        pictures_and_videos,
+        relative_names,
+    )
     from darswin.data.cameras import Calibrations, is_json
-    from darswin.utils.image import BrokenImageError
     from darswin.utils.progress import Progress
 
     look = Look(view, fov_deg, yaw_deg, pitch_deg, up)
@@ -101,17 +106,17 @@ def undistort(
     (folder / LENS).unlink(missing_ok=True)
     views = _Views(calibrations, look, size, theta_max_deg)
     names = relative_names(paths, files)
-    bad: list[str] = []
+    broken = Broken()
     written: dict[str, Lens | None] = {}
     try:
         with Progress("undistort", len(files)) as progress:
             for file in files:
                 undistort_file = _video if file.is_video else _picture
-                try:
-                    target, lens = undistort_file(file.name, folder / names[file.name], views, bad)
+                with broken.skipped(ValueError):
+                    target, lens = undistort_file(
+                        file.name, folder / names[file.name], views, broken
+                    )
                     written[target.relative_to(folder).as_posix()] = lens
-                except (BrokenImageError, ValueError) as error:
-                    bad.append(with_flags(error))
                 progress.done += 1
     finally:
         replace_file(folder / RECORD, json.dumps([*written], indent=1, ensure_ascii=False))
@@ -119,13 +124,11 @@ def undistort(
     if written:
         with_lens = f"; their calibration is {folder / LENS}" * (folder / LENS).exists()
         print(f"{folder}: {len(written)} of {len(files)} files, {views.said}{with_lens}")
-    if bad:
-        raise BrokenImageError("\n".join(bad))
+    broken.report()
 
 
 class _Viewed(NamedTuple):
     sampler: "Sampler"
-    lens: Lens  # of the picture; it keeps the identity by which the plan is found
     camera: Lens | None  # the perspective camera of the view
 
 
@@ -136,9 +139,11 @@ class _Views:
         self, calibrations: "Calibrations", look: Look, size: tuple[int, int] | None,
         theta_max_deg: float | None,
     ):  # fmt: skip
+        from darswin.cli.pictures import ByLens
+
         self._calibrations, self._look = calibrations, look
         self._size, self._theta_max_deg = size, theta_max_deg
-        self._plans: dict[tuple[int, bool], _Viewed] = {}
+        self._by_lens = ByLens()
         self._said: set[str] = set()
 
     @property
@@ -150,12 +155,7 @@ class _Views:
     def of(self, name: str, size: tuple[int, int], orientation: int, even: bool) -> _Viewed:
         """The view of an upright picture of (H, W); `even` makes its sides even."""
         lens = self._calibrations.lens_of(Path(name), size, orientation)
-        key = id(lens), even
-        if key not in self._plans:
-            if len(self._plans) == _KEPT:
-                del self._plans[next(iter(self._plans))]
-            self._plans[key] = self._planned(lens, size, even)
-        return self._plans[key]
+        return self._by_lens(lens, lambda: self._planned(lens, size, even), even)
 
     def _planned(self, lens: Lens, size: tuple[int, int], even: bool) -> _Viewed:
         exact = lens.to(torch.float64)
@@ -176,10 +176,10 @@ class _Views:
         if self._look.view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
             camera = to_corners(Perspective.from_fov(fov, width / 2, image_size=(height, width)))
-        return _Viewed(view.at(exact, size).sampler(), lens, camera)
+        return _Viewed(view.at(exact, size).sampler(), camera)
 
 
-def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path, Lens | None]:
+def _picture(name: str, target: Path, views: _Views, _: "Broken") -> tuple[Path, Lens | None]:
     """Undistorts a picture; returns its new path and the camera of the view."""
     from darswin.utils.image import read_header, read_oriented, write_image, written_as
 
@@ -193,7 +193,7 @@ def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path
     return target, viewed.camera
 
 
-def _video(name: str, target: Path, views: _Views, bad: list[str]) -> tuple[Path, Lens | None]:
+def _video(name: str, target: Path, views: _Views, broken: "Broken") -> tuple[Path, Lens | None]:
     """`_picture` for a video. If it is cut off, the frames before are written."""
     from darswin.utils import video
     from darswin.utils.image import BrokenImageError
@@ -210,7 +210,7 @@ def _video(name: str, target: Path, views: _Views, bad: list[str]) -> tuple[Path
         except BrokenImageError as error:
             if not cameras:
                 raise
-            bad.append(with_flags(error))
+            broken.errors.append(with_flags(error))
 
     if target.suffix.lower() not in video.WRITTEN:
         target = target.with_name(f"{target.name}.mp4")

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import torch
 
-from darswin.cli.predict import is_below
+from darswin.cli.pictures import ByLens, is_below
 from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
@@ -45,7 +45,6 @@ RECORD, LENS, VIEW, LEFT = "warp.json", "lens.json", "view.json", "left.json"
 COCO, PICTURES = "annotations.json", "images"
 _SIZE = (512, 512)  # of a view
 _NAMED = 10  # pictures that cannot be read
-_KEPT = 8  # lenses whose maps are in memory
 
 
 def warp(
@@ -147,7 +146,7 @@ class _Maps:
     """What pictures of one lens become: pictures of another camera, or of a view."""
 
     def __init__(self, lens: Lens, view: PixelView):
-        self.lens, seen = lens, to_corners(lens)
+        seen = to_corners(lens)
         self.remap = view.at(seen, picture_size(lens))
         self.said = json.dumps(to_dict(seen))
 
@@ -162,7 +161,7 @@ class _Work:
     data: LabelledPictures
     view: PixelView
     folder: Path
-    maps: dict[int, _Maps] = field(default_factory=dict)
+    by_lens: ByLens = field(default_factory=ByLens)
 
     def __call__(self, file: str, raw: Any) -> _Warped:
         try:
@@ -176,7 +175,8 @@ class _Work:
         name = self.data.folder / file
         header = read_header(name)
         labels, wrong = self.data.read(raw, header.upright)
-        maps = self._maps_of(self.data.lenses.lens_of(name, header.upright, header.orientation))
+        lens = self.data.lenses.lens_of(name, header.upright, header.orientation)
+        maps = self.by_lens(lens, lambda: _Maps(lens, self.view))
         files = _new_names(file, self.view.count)
         if not all((self.folder / file).is_file() for file in files):
             image, orientation = read_oriented(name, header.channels)
@@ -197,13 +197,6 @@ class _Work:
             for things, tile in zip(moved, maps.remap.tiles, strict=True)
         ]
         return _Warped([*zip(files, shown, strict=True)], left, maps.said, wrong=wrong)
-
-    def _maps_of(self, lens: Lens) -> _Maps:
-        if id(lens) not in self.maps:
-            if len(self.maps) == _KEPT:
-                del self.maps[next(iter(self.maps))]
-            self.maps[id(lens)] = _Maps(lens, self.view)
-        return self.maps[id(lens)]  # it keeps the lens, and so its identity
 
 
 def _new_names(file: str, count: int) -> list[str]:

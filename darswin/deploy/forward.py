@@ -12,9 +12,10 @@ from darswin.deploy.own import OwnLinear, OwnNorm, pack
 from darswin.deploy.packed import InDtype, OwnBlocks, refuse_gradients
 from darswin.deploy.program import AND_GELU, NOTHING, RUN, Program, Slot, Weights
 from darswin.lens.pixels import OUTSIDE
-from darswin.models.base import Model, Prepared
+from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import RAYS, DistanceHead, PixelHead
+from darswin.models.prepared import Prepared
 from darswin.models.unet import PatchExpand, Unet
 from darswin.views import PolarView
 from darswin.views.base import Pair

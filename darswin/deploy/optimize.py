@@ -19,9 +19,10 @@ from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
-from darswin.models.base import Model, Prepared
+from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
+from darswin.models.prepared import Prepared
 from darswin.ops import _module
 from darswin.views.base import Pair
 

@@ -124,35 +124,9 @@ def _cosines(values: Tensor, lens: Lens) -> Tensor:
     return cosine[:, None] if values.dim() == 4 else cosine
 
 
-def reprojection(
-    source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
-) -> Tensor:
-    """The map (N, H, W, 2) of `target`'s pixels in `source`'s image; `OUTSIDE` where a ray is
-    beyond either θ_max. Differentiable in both lenses. The sizes are (H, W) of their images."""
-    theta, direction = pixel_rays(target, size)
-    return as_map(source.seen_pixels(theta, direction, source_size))
-
-
 def as_map(pixels: Tensor) -> Tensor:
     """Pixels (..., 2) with `OUTSIDE` in place of NaN."""
     return torch.where(pixels.isnan(), OUTSIDE, pixels)
-
-
-def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
-    """Resamples images of `source` as `target` would see them, bilinearly; 0 beyond either θ_max.
-
-    Runs on the images' device. Gradients go to the images and both lenses.
-
-    Args:
-        images: (B, C, H, W), floating point, taken with `source`.
-        source, target: B lenses each, or one.
-        size: (H', W') of the view.
-
-    Returns:
-        (B, C, H', W').
-    """
-    height, width = images.shape[2:]
-    return sample_at(images, reprojection(source, (height, width), target, size))
 
 
 def sample_at(images: Tensor, pixels: Tensor) -> Tensor:

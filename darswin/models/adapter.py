@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from darswin.lens import Lens
-from darswin.models.base import Model, Prepared, check_given_once
+from darswin.models.base import Model, check_given_once
 from darswin.models.detections import detections_to_images, find_detections
+from darswin.models.prepared import Prepared
 from darswin.views import PixelView, View, make_view
 from darswin.views.base import Pair, PerChannel, size_of
 from darswin.views.remap import Remaps

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -12,14 +12,13 @@ from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.transformer import Block, Stage
 from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
+from darswin.models.prepared import Prepared
 from darswin.ops._library import transformed
 from darswin.ops.checks import per_channel, readable
 from darswin.views import View, make_view
 from darswin.views.base import (
     Pair,
     PerChannel,
-    PreparedPixels,
-    PreparedPolar,
     check_images,
     check_one_picture,
 )
@@ -29,24 +28,6 @@ Result = TypeVar("Result", covariant=True)
 # Images in floating point with larger values have not been normalized: with ImageNet's statistics,
 # normalized images end at 2.7.
 LARGEST_NORMALIZED = 20
-
-
-class Prepared(NamedTuple):
-    """Everything of N lenses that a model needs, for images of one size.
-
-    - `view`: what its view needs; `view.shown`, (N or 1, H, W), is True for the pixels of the
-      images that the view shows, and None if it shows all.
-    - `rays`: `View.ray_channels`, if the network reads them.
-    - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
-    - `tables`: for each stage, the position biases of its blocks.
-    - `remaps`: the `Remap` of each lens, by which detections come back; None without detections.
-    """
-
-    view: PreparedPixels | PreparedPolar
-    rays: Tensor | None = None
-    tokens: Sequence[Tensor] = ()
-    tables: Sequence[Sequence[Tensor]] = ()
-    remaps: Sequence[Any] | None = None
 
 
 class Model(nn.Module, Generic[Result]):

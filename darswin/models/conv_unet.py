@@ -7,9 +7,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.models.base import Prepared, check_given_once, view_of_model
+from darswin.models.base import check_given_once, view_of_model
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
+from darswin.models.prepared import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.utils.tasks import PixelTask
 from darswin.views import View

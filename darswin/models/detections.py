@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from darswin import boxes as of_boxes
-from darswin.models.base import Prepared
+from darswin.models.prepared import Prepared
 from darswin.views import PixelView, Remap, View
 
 NAMES = ("boxes", "scores", "labels")

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from darswin.layers.linear import Linear
 from darswin.layers.transformer import Block, PatchMerging, Stage
 from darswin.lens import Lens
-from darswin.models.base import Model, Prepared, init_weights
+from darswin.models.base import Model, init_weights
 from darswin.models.features import FeatureInfo, feature_info, take_indices
+from darswin.models.prepared import Prepared
 from darswin.models.stages import StageSizes
 from darswin.views.base import Pair
 

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.layers.transformer import Stage
-from darswin.models.base import Prepared, init_by_width
+from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import RAYS, PixelModel, with_rays
+from darswin.models.prepared import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.swin import Swin
 from darswin.utils.tasks import PixelTask

@@ -19,7 +19,6 @@ from darswin.views.base import Pair, PerChannel, check_lens
 
 if TYPE_CHECKING:
     from darswin.frames.plans import Output, Plan, Sampler
-    from darswin.views.pixels import PixelView
 
 Points = TypeVar("Points", np.ndarray, Tensor)
 
@@ -61,7 +60,7 @@ class Remap:
         ValueError: there are several lenses, or the lens belongs to pictures of another size.
     """
 
-    def __init__(self, view: "PixelView", lens: Lens | None, size: Pair):
+    def __init__(self, view: Any, lens: Lens | None, size: Pair):
         self.view, self.size = view, check_pair("size", size, 1)
         self.view_size = view.size or self.size
         self._given = lens
@@ -167,7 +166,7 @@ class Remap:
         return moved.to(points.device, torch.promote_types(points.dtype, torch.float32))
 
     @cached_property
-    def _bound(self) -> "PixelView":
+    def _bound(self) -> Any:
         return self.view if self.lens is None else self.view.for_lens(self.lens, self.size)
 
     # -- pictures and maps --------------------------------------------------------------------
@@ -304,7 +303,7 @@ class Remap:
 class Remaps(Sequence[Remap]):
     """The maps of N lenses, each made when it is first used."""
 
-    def __init__(self, view: "PixelView", lens: Lens | None, size: Pair):
+    def __init__(self, view: Any, lens: Lens | None, size: Pair):
         self._view, self._lens, self._size = view, lens, size
         self._made: dict[int, Remap] = {}
 

@@ -19,18 +19,18 @@ from darswin.cli.answers import (
     ClassAnswers,
     DistanceAnswers,
     LabelAnswers,
-    claim_folder,
     distance_png,
-    file_names,
     label_png,
 )
 from darswin.cli.main import main
+from darswin.cli.pictures import claim_folder, file_names
+from darswin.cli.predict import ANSWERS as RECORD
 from darswin.data import FullSize, fitted
 from darswin.data.framing import CutOff
 from darswin.lens import Equidistant, KannalaBrandt, from_dict
 from darswin.lens.pixels import pixel_angles
-from darswin.models.base import Prepared
 from darswin.models.encoder import Encoder
+from darswin.models.prepared import Prepared
 from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, save_model
 from darswin.train.finetuning import models_for
@@ -294,14 +294,14 @@ def test_nothing_but_its_own_is_replaced(tmp_path):
     for out, said in ((None, "missing --out"), ("in", "holds other files"),
                       ("in/p.png", "is a file"), ("list", "holds other files")):  # fmt: skip
         with pytest.raises(ValueError, match=said):
-            claim_folder(out and str(tmp_path / out))
+            claim_folder(out and str(tmp_path / out), RECORD)
     assert [path.name for path in (tmp_path / "in").iterdir()] == ["p.png"]
     (tmp_path / "empty").mkdir()
     for out in ("empty", "new/out"):
-        assert claim_folder(str(tmp_path / out)) == tmp_path / out
+        assert claim_folder(str(tmp_path / out), RECORD) == tmp_path / out
         assert json.loads((tmp_path / out / "predictions.json").read_text()) == []
         (tmp_path / out / "labels").mkdir()  # of a run that was killed
-        claim_folder(str(tmp_path / out))
+        claim_folder(str(tmp_path / out), RECORD)
 
 
 def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):

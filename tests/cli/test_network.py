@@ -339,7 +339,7 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --view mercator:3", "'mercator' has no such option: .*'count'"),
         ("--network n.onnx --view tiles:x", r"--view must be NAME or NAME:COUNT, .* got tiles:x"),
         ("--network n.onnx --view tiles:3", "count must be from 4 to 9, got 3"),
-        ("--network n.onnx --view square --fov_deg 90", "'square' has no such option: .*'fov'"),
+        ("--network n.onnx --view none --fov_deg 90", "'none' has no such option: .*'fov'"),
         ("--network n.onnx --view none --up 0,0,1", "'none' has no such option: .*'up'"),
         ("--network n.onnx --fov_deg 0", "--fov_deg must be above 0° and at most 360° for a"),
         ("--network n.onnx --view tangent --fov_deg 180", "--fov_deg .* at most 179.9° for a tang"),

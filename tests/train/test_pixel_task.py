@@ -11,7 +11,7 @@ from scenes import write_plain
 from darswin.data import IGNORE
 from darswin.lens import Equidistant, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
-from darswin.models.base import Prepared
+from darswin.models.prepared import Prepared
 from darswin.train import pixel_task
 from darswin.train.distance import Distance, DistanceData
 from darswin.train.pixel_task import Rays

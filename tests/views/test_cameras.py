@@ -17,6 +17,7 @@ from darswin.lens import (
     BrownConrady,
     Equidistant,
     KannalaBrandt,
+    Mei,
     OCam,
     Perspective,
     Polynomial,
@@ -24,7 +25,7 @@ from darswin.lens import (
     load,
 )
 from darswin.lens.orientation import upright
-from darswin.lens.pixels import pixel_angles
+from darswin.lens.pixels import OUTSIDE, pixel_angles
 from darswin.views import CameraView, CropView, Turn
 from darswin.views.turn import STILL
 
@@ -406,3 +407,69 @@ def test_a_mirrored_picture_has_mirrored_targets(whole, size):
     same = plain[:, ::-1] == mirrored
     same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
     assert same.all()
+
+
+# -- batches of lenses, and gradients
+
+f64 = torch.float64
+
+
+def test_another_camera_is_read_bilinear_between_pixel_centres():
+    image = torch.arange(12.0).reshape(1, 1, 3, 4)
+    lens = Perspective(10.0, 1.2)
+    torch.testing.assert_close(CameraView(lens, (3, 4))(image, lens), image, rtol=0, atol=1e-5)
+    moved = Perspective(10.0, 1.2, center=[1.0, 0.75])  # half a pixel and a quarter
+    got = CameraView(moved, (3, 4))(image, lens)
+    torch.testing.assert_close(got[..., :2, :3], image[..., :2, :3] + 0.5 + 0.25 * 4)
+    torch.testing.assert_close(got[0, 0, 0, 3], torch.tensor((3 + 0.25 * 4) / 2))  # half is outside
+
+
+def test_other_cameras_of_many():
+    images = torch.rand(2, 3, 20, 24)
+    source = Spherical.from_fov([0.2, 0.9], 2.0, 10.0)
+    target = Perspective.from_fov(1.8, 8.0)
+    view = CameraView(target, (16, 18), reads=1)
+    together = view(images, source)
+    assert together.shape == (2, 3, 16, 18)
+    for k in range(2):
+        alone = view(images[k : k + 1], source[k])
+        torch.testing.assert_close(together[k : k + 1], alone)
+    half = view(images.bfloat16(), source)
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), together, rtol=0, atol=0.01)
+    assert view(images[:0], source[:0]).shape == (0, 3, 16, 18)
+    assert math.hypot(7.5, 8.5) > 8.0 and not together[..., 0, 0].any()  # beyond θ_max
+
+
+def test_a_ray_keeps_its_angles():
+    general = Mei(1.5, 40.0, (0.05, 0.2), 1.1, (30.0, 22.5), affine=[[1.0, 0.05], [0.0, 0.8]],
+                  tangential=(0.02, -0.03), image_size=(46, 64)).to(f64)  # fmt: skip
+    tilted = KannalaBrandt(20.0, [0.02], 1.7, affine=[[1.0, 0.0], [0.1, 1.1]]).to(f64)
+    radial = Perspective.from_fov(2.4, 25.0, center=[28.0, 21.5]).to(f64)
+    several = Spherical.from_fov([0.2, 0.9], 2.4, 30.0).to(f64)
+    for a, b in ((general, tilted), (tilted, general), (radial, several)):
+        found = CameraView(b, (40, 50), reads=1).image_points(a, (46, 64))
+        assert found.shape == (len(b), 40, 50, 2)
+        for there, lens in zip(found, b, strict=True):
+            seen = there[..., 0] != OUTSIDE
+            assert 0.3 < seen.double().mean() < 1
+            y, x = seen.nonzero().unbind(1)
+            theta, azimuth = lens.unproject_pixels(torch.stack((x, y), -1).double(), (40, 50))
+            torch.testing.assert_close(there[seen], a.project_rays(theta, azimuth, (46, 64)))
+
+
+@pytest.mark.parametrize("radial", [True, False])
+def test_gradients_reach_both_lenses_also_at_the_centre_and_where_nothing_is_seen(radial):
+    def places(focal, xi, tangential, affine, center):
+        if radial:
+            view = CameraView(Spherical(xi, focal, 1.2), (9, 9), reads=1)
+            return view.image_points(Perspective(focal, 1.2), (4, 4))
+        source = Mei(xi, focal, (0.05, 0.2), 1.2, center, affine=affine, tangential=tangential)
+        target = Mei(1.0, focal, None, 1.3, affine=affine, tangential=tangential)
+        return CameraView(target, (9, 9), reads=1).image_points(source, (40, 40))
+
+    parameters = [[2.9], [1.5], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
+    tensors = [torch.tensor(p, dtype=f64, requires_grad=True) for p in parameters]
+    there = places(*tensors)
+    assert (there == OUTSIDE).any() and (there[0, 4, 4] != OUTSIDE).all()
+    assert torch.autograd.gradcheck(places, tensors, fast_mode=True)

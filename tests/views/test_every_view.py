@@ -259,11 +259,11 @@ class AnyRatio(PixelView):
     def of(self, lens):
         return Equidistant(min(self.size) / 2 / lens.theta_max, lens.theta_max)
 
-    def image_points(self, lens, size):
-        return pixels.reprojection(lens, size, self.of(lens), self.size)
+    def to_rays(self, points, lens, size):
+        return self.of(lens).unproject_points(points, self.size)
 
-    def view_points(self, lens, size):
-        return pixels.reprojection(self.of(lens), self.size, lens, size)
+    def to_points(self, rays, lens, size):
+        return self.of(lens).project_points(rays, self.size)
 
     def pixel_rays(self, lens, size):
         return pixels.pixel_rays(self.of(lens), self.size)

@@ -18,9 +18,8 @@ from darswin.lens import (
     Spherical,
 )
 from darswin.lens.concentric import square_to_disc
-from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
-from darswin.views import PlainView, make_view
+from darswin.views import CameraView, PlainView, make_view
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
 GENERAL = KannalaBrandt(
@@ -200,6 +199,10 @@ def scene(size):
 
 
 @torch.no_grad()
+def reproject(images, own, lens, size):
+    return CameraView(lens, size, reads=1)(images, own)
+
+
 def undistorted(picture, lens, **options):
     """The images that a model gives to its first layer."""
     side, seen = picture.shape[2], []

@@ -1,0 +1,141 @@
+"""The pictures and videos of commands: their files, what is made of each lens once, the folder that
+is written to, and the files that cannot be read.
+"""
+
+import json
+import os
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from darswin.cli.arguments import can_write
+from darswin.data.folders import PICTURES, pictures_and_videos_below
+from darswin.lens import Lens
+from darswin.utils.files import check_is_file, replace_file
+from darswin.utils.image import BrokenImageError
+from darswin.utils.parameters import with_flags
+from darswin.utils.video import is_video
+
+Made = TypeVar("Made")
+
+
+class File(NamedTuple):
+    """A picture or a video."""
+
+    name: str
+    is_video: bool
+
+
+def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
+    """The files at the paths; a folder stands for all pictures and videos in it."""
+    files = []
+    for path in paths:
+        names = [str(path)]
+        if os.path.isdir(path) and not _is_picture(path):
+            below = pictures_and_videos_below(Path(path))
+            names = [n for n in below if leave_out is None or not is_below(n, leave_out)]
+            for name in names:
+                check_is_file(name)
+        files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
+    return files
+
+
+def check_paths(paths: Sequence[str]) -> None:
+    """FileNotFoundError that lists all missing files; ValueError for pipes, devices and sockets."""
+    if missing := [path for path in paths if not os.path.exists(path)]:
+        raise FileNotFoundError(f"there is no file or folder {', '.join(missing)}")
+    for path in paths:
+        check_is_file(path)
+
+
+def _is_picture(path: str) -> bool:
+    return os.path.splitext(path)[1].lower() in PICTURES
+
+
+def is_below(path: str, folder: str) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+class ByLens:
+    """What is made of a lens, kept for the last `most` lenses.
+
+    A lens is known by its identity: pictures of one camera should have the same object.
+    """
+
+    def __init__(self, most: int = 8):
+        self._most = most
+        self._kept: dict[Hashable, tuple[Lens, object]] = {}  # with the lens, which so stays itself
+
+    def __call__(self, lens: Lens, make: Callable[[], Made], *more: Hashable) -> Made:
+        """What `make` makes of a lens; more: what else it depends on."""
+        key = id(lens), *more
+        if key not in self._kept:
+            made = make()
+            if len(self._kept) == self._most:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = lens, made
+        return self._kept[key][1]  # type: ignore[return-value]
+
+
+class Broken:
+    """The errors of files that cannot be read: all others are done first, then these are named."""
+
+    def __init__(self) -> None:
+        self.errors: list[str] = []
+
+    @contextmanager
+    def skipped(self, *kinds: type[Exception]) -> Iterator[None]:
+        """Keeps an error of these kinds, and `BrokenImageError`, for the end."""
+        expected: tuple[type[Exception], ...] = (BrokenImageError, *kinds)
+        try:
+            yield
+        except expected as error:
+            self.errors.append(with_flags(error))
+
+    def report(self, heading: str = "") -> None:
+        """Raises BrokenImageError with all errors, if there are any."""
+        if self.errors:
+            raise BrokenImageError("\n".join([heading] * bool(heading) + self.errors))
+
+
+def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
+    """The names of output files for pictures and videos: their paths relative to the common folder
+    of all arguments, without the endings of pictures unless two names would become equal."""
+    whole = relative_names(paths, files)
+    videos = {name for name, is_video in files if is_video}
+    short = {n: w if n in videos else os.path.splitext(w)[0] for n, w in whole.items()}
+    return short if len(set(short.values())) == len(set(whole.values())) else whole
+
+
+def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
+    """The paths of pictures and videos relative to the common folder of all arguments."""
+    folders = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
+    root = os.path.commonpath(folders)
+    return {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+
+
+def claim_folder(out: str | None, record: str) -> Path:
+    """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
+    which left the file `record` there."""
+    if out is None:
+        raise ValueError("missing --out: this model writes pictures; give a folder for them")
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
+    if not can_write(folder.absolute()):
+        raise ValueError(f"--out must be a folder that can be written, got {out}")
+    if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
+        raise ValueError(
+            f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "
+            "run of this command, whose files are replaced"
+        )
+    replace_file(folder / record, "[]")
+    return folder
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        return isinstance(json.loads(file.read_bytes()), list)
+    except (OSError, ValueError):
+        return False
