@@ -69,6 +69,7 @@ class Remap:
 
     @cached_property
     def lens(self) -> Lens | None:
+        """The lens of the pictures, float64 on the CPU, or None."""
         if self._given is None:
             return None
         return self._given.detach().to("cpu", torch.float64)
