@@ -83,7 +83,7 @@ CASES = {
     "sampler": (frames.Sampler(PLAN), PICTURE),
     "turned": (MOVED, PICTURE),
     "picture": (REMAP, RNG.random(SIZE, np.float32)),
-    "target": (MOVED.target, VALUES),
+    "target": (MOVED.target, RNG.uniform(1, 9, SIZE).astype(np.float32)),
     "resized picture": (fitted(SIZE, 32, "whole").at(CAMERA, SIZE), PICTURE),
     "labels": (FULL.labels, RNG.normal(size=(3, 48, 48)).astype(np.float32)),
     "distance": (FULL.distance, VALUES),

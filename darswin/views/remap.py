@@ -51,9 +51,8 @@ class Remap:
     tile; pictures and maps are those of all tiles.
 
     Attributes:
-        view: the view. size: (H, W) of the camera's pictures. view_size: (H', W') of the view, or
-            of a tile.
-        lens: the lens of the pictures, float64 on the CPU, or None.
+        view: the `PixelView`. size: (H, W) of the camera's pictures. view_size: (H', W') of the
+            view, or of a tile.
 
     Raises:
         TypeError: the lens is missing, and the view uses one.
@@ -69,7 +68,7 @@ class Remap:
 
     @cached_property
     def lens(self) -> Lens | None:
-        """The lens of the pictures, float64 on the CPU, or None."""
+        """The lens of the pictures, in float64 on the CPU, or None."""
         if self._given is None:
             return None
         return self._given.detach().to("cpu", torch.float64)
@@ -186,9 +185,12 @@ class Remap:
         if isinstance(picture, Tensor):
             return self.view.see(picture, self._prepared)
         picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
+        self._check_size(picture)
+        return self.view.picture(picture, self)
+
+    def _check_size(self, picture: np.ndarray) -> None:
         if picture.shape[:2] != self.size:
             raise ValueError(f"the picture must be (H, W) = {self.size}, got {picture.shape[:2]}")
-        return self.view.picture(picture, self)
 
     def sampled(self, picture: np.ndarray) -> np.ndarray:
         """`remap(picture)` by points: compiled for uint8 and float32, else through torch."""
@@ -262,6 +264,7 @@ class Remap:
             (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where
             the view shows nothing.
         """
+        self._check_size(target)
         x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
         height, width = self.size
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)

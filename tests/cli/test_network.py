@@ -342,7 +342,10 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --view none --fov_deg 90", "'none' has no such option: .*'fov'"),
         ("--network n.onnx --view none --up 0,0,1", "'none' has no such option: .*'up'"),
         ("--network n.onnx --fov_deg 0", "--fov_deg must be above 0° and at most 360° for a"),
-        ("--network n.onnx --view tangent --fov_deg 180", "--fov_deg .* at most 179.9° for a tang"),
+        (
+            "--network n.onnx --view perspective --fov_deg 180",
+            "--fov_deg .* at most 179.9° for a pers",
+        ),
         ("--network n.onnx --fov_deg 400", "--fov_deg must be above 0°"),
         ("--network n.onnx --up 0,0,0", "--up must be three finite numbers"),
         (

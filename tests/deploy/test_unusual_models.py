@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from helpers import create, relative_error
+from helpers import relative_error
 
-from darswin import optimize
+from darswin import create_model, optimize
 from darswin.deploy.camera import plan
 from darswin.deploy.export import export_program
 from darswin.deploy.quantize import quantize_model
@@ -39,7 +39,7 @@ KINDS = {
     "maps of an empty stage": ("darswin_ra_nano", dict(RA, depths=(0, 1), features_only=True)),
     "patches of one pixel": ("swin_nano", dict(ONE, image_size=(8, 16), patch_size=1)),
     "one patch": ("swin_nano", dict(ONE, image_size=16, patch_size=16, mlp_ratio=0.5)),
-    "a view and no block": ("swin_nano perspective", dict(ONE, image_size=16, depths=(0,))),
+    "a view and no block": ("swin_nano", dict(ONE, view="perspective", image_size=16, depths=(0,))),
     "deformable, narrow": (
         "dat_nano", dict(ONE, image_size=16, blocks=("D",), groups=(2,), mlp_ratio=0.5)
     ),
@@ -56,7 +56,7 @@ KINDS = {
 def network(kind):
     name, options = KINDS[kind]
     torch.manual_seed(0)
-    model = create(name, **(dict(num_classes=5) | options)).eval()
+    model = create_model(name, **(dict(num_classes=5) | options)).eval()
     for parameter in model.parameters():
         mean = 1.0 if parameter.dim() == 1 else 0.0
         torch.nn.init.normal_(parameter, mean=mean, std=0.2)

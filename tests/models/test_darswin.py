@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from frames import at_size
 
 from darswin import create_model
-from darswin.data import at_size
 from darswin.lens import Equidistant, KannalaBrandt, Spherical
 from darswin.models.stages import stage_sizes
 

@@ -428,7 +428,7 @@ WRONG = [
     ("swin_nano", dict(image_size=24), r"stage 2: window \(4, 4\) must divide the map, \(6, 6"),
     ("swin_nano", dict(view=dict(name="perspective", fov=4)), r"fov must be in \(0, 3.14\] rad"),
     ("swin_nano", dict(view=dict(fov=1.0)), "view must have a name, got {'fov': 1.0}"),
-    ("swin_nano", dict(view=make_view("mercator", 32), mean=0.4), "has its own mean: leave them"),
+    ("swin_nano", dict(view=make_view("mercator", 32), mean=0.4), "its own mean: leave them"),
     ("conv_unet_nano", dict(view=make_view("mercator", 32), size=32), "has its own size: leave"),
     ("swin_nano", dict(view=make_view("none", 64)), r"must have image_size = \(32, 32\), got"),
     ("dat_nano", dict(blocks=("L", "N", "D")), "blocks must be of the kinds 'L', 'S' and 'D'"),

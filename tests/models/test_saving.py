@@ -152,7 +152,8 @@ def test_a_file_of_before_the_views_had_their_options_is_read_or_refused(
     keeps |= {name: options[name] for name in ("task",) if name in options}
     keeps |= dict(spacing="g") if view == "polar" else {}
     made = create_model(new, **keeps, **({} if view in (None, "polar") else dict(view=view)))
-    entry = json.dumps(dict(model=model, options=keeps | options))
+    card = dict(classes=[], size=64, fov=2.0, fit="stretch", task="classification", colors=[])
+    entry = json.dumps(card | dict(model=model, options=keeps | options, quantized=False))
     weights = {name: tensor.contiguous() for name, tensor in made.state_dict().items()}
     save_file(weights, path, metadata={"darswin": entry})
     if view is None:
