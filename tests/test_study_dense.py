@@ -46,7 +46,7 @@ def test_maps_show_all_of_the_pictures(label):
         prepared = model.prepare(lens, (dense_data.SIZE,) * 2)
         rays = pixel_rays(lens, (dense_data.SIZE,) * 2)[0]
         seen = ~rays.isnan()
-        shown = model.view.back(ones, prepared)[0][seen] > 0.5
+        shown = model.view.back(ones, prepared.view)[0][seen] > 0.5
         assert shown.float().mean() > 0.999 and seen.float().mean() > 0.7
 
 

@@ -21,11 +21,12 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
+from darswin.models.prepared import Prepared
 from darswin.models.saving import ModelCard
 from darswin.ops import _module
 from darswin.utils.files import replace_file
 from darswin.utils.tasks import Fit
-from darswin.views import Prepared, Remap
+from darswin.views import Remap
 from darswin.views.camera import picture_size
 from darswin.viz.pixels import (
     UNKNOWN,
@@ -199,7 +200,7 @@ class PixelAnswers(ModelAnswers):
         self.out, self.names = out, names
 
     def _full_size(self, remap: Remap, prepared: Prepared) -> FullSize:
-        return FullSize(remap, prepared.shown)
+        return FullSize(remap, prepared.view.shown)
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.model.run(images, prepared)

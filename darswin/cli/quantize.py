@@ -121,8 +121,8 @@ def _comparison(
             results.add(a, b)
             before, after = a.argmax(1), b.argmax(1)
             valid = (target >= 0) & (target < a.shape[1])
-            if prepared.shown is not None:
-                valid &= prepared.shown
+            if prepared.view.shown is not None:
+                valid &= prepared.view.shown
             pictures, pixels = pictures + len(a), pixels + before.numel()
             known += int(valid.sum())
             right += int((before == target)[valid].sum())

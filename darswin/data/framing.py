@@ -109,7 +109,7 @@ class FullSize:
 
     Args:
         remap: `fitted(…).at(lens, (H, W))`, of one lens.
-        shown: (1, h, w), the pixels that the model's view shows: `model.prepare(…).shown`. None
+        shown: (1, h, w), the pixels that the model's view shows, as the model prepares it. None
             means that it shows all that the lens sees.
     """
 

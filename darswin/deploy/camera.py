@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from darswin.deploy.forward import NoProgramError, frame_program
 from darswin.deploy.optimize import check_model, optimize
@@ -17,11 +17,13 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import FeatureMaps
 from darswin.ops.checks import check_pair, per_channel
-from darswin.views import PixelView, PolarGrid, PolarView, View
+from darswin.views import PixelView, PolarView, View
 from darswin.views.base import Pair, check_lens
 
 __all__ = ["export_network", "plan"]
 
+# The output of a plan, and its mean and std; None for those of the model or the view.
+_Form = tuple[Output | None, float | Sequence[float] | None, float | Sequence[float] | None]
 _VERSION = (1, 0)  # csrc/core/network_file.h describes the file
 
 
@@ -55,8 +57,7 @@ def plan(
     if output is not None:
         check_output(output)
     size = check_size(check_pair("size", size, 1))
-    found = _reading(sample, lens, size)
-    return _plan_of(sample, found, size, output or found.output, mean, std)
+    return _plan(sample, lens, size, (output, mean, std))
 
 
 def export_network(
@@ -106,11 +107,11 @@ def export_network(
     names = list(model.pretrained_cfg.get("label_names", ()) if labels is None else labels)
     if names and (len(names) != model.num_classes or not all(isinstance(n, str) for n in names)):
         raise ValueError(f"labels must be {model.num_classes} names, one for each class")
+    form = (None, mean, std)
     if model.view.uses_lens:
-        found = _reading(model, lens, size, exact=False)
+        places = _plan(model, lens, size, form, exact=False)
     else:
-        found = _every_pixel(model, size)
-    places = _plan_of(model, found, size, found.output, mean, std)
+        places = _every_pixel(model, size, form)
     try:
         with torch.no_grad(), own_alone():
             fast = optimize(model, torch.int8 if quantized_layers(model) else torch.float32)
@@ -138,79 +139,55 @@ def export_network(
     )
 
 
-class _Reading(NamedTuple):
-    """The points at which images of one size are read, and the usual form of the result."""
-
-    points: PolarGrid | Tensor  # the polar grid of one lens, or pixels (H', W', 2)
-    output: Literal["tokens", "image"]  # of `Plan`
-    samples: Pair | None  # (S_r, S_φ) of a token of the grid
-    channels: int | None  # of the frames, if the sampling says it
-    # The normalization of frames; None if the sampling has none of its own.
-    mean: float | Sequence[float] | None
-    std: float | Sequence[float] | None
-    tiles: int = 1  # pictures below each other
-    reads: int = 1  # points along each side of a pixel
-
-
 @torch.no_grad()
-def _reading(sample: nn.Module, lens: Lens | None, size: Pair, *, exact: bool = True) -> _Reading:
-    """The points at which a model, a layer or a view reads images of (H, W).
-
-    The points of views are as exact as can be; or, without `exact`, those at which a model itself
-    reads. A polar grid is always the model's own: its samples have the bits of `polar_sample`.
-    """
+def _plan(
+    sample: nn.Module, lens: Lens | None, size: Pair, form: _Form, *, exact: bool = True
+) -> Plan:
+    """The points of views are as exact as can be; or, without `exact`, those at which a model
+    itself reads. A polar grid is always the model's own: its samples have the bits of
+    `polar_sample`."""
     lens = check_lens(lens, size)
     if len(lens) != 1:
         raise ValueError(f"a plan needs one lens, got {len(lens)}")
     view = sample.view if isinstance(sample, Model) else sample
     if not isinstance(view, View):
         raise TypeError(f"sample must be a model or a view of darswin, got {type(sample).__name__}")
-    channels = sample.in_chans if isinstance(sample, Model) else None
-    dtype = torch.float64 if exact and isinstance(view, PixelView) else lens.theta_max.dtype
-    points = view.prepare(lens.to("cpu", dtype), size, back=False, rays=False).points
-    if points is None:
-        raise ValueError("the model takes images as they are: it needs no plan")
+    lens = lens.to("cpu", torch.float64 if exact and isinstance(view, PixelView) else None)
+    prepared = view.prepare(lens, size, back=False)
     if isinstance(view, PolarView):
-        return _Reading(points, view.layout, view.samples, channels, view.mean, view.std)
-    assert isinstance(points, Tensor)
-    reads = points.shape[2] // view.size[1] if isinstance(view, PixelView) and view.size else 1
-    return _Reading(points[0], "image", None, channels, view.mean, view.std, view.count, reads)
+        names = ("radii", "azimuths", "center", "affine", "offsets")
+        parts = {name: getattr(prepared.grid, name) for name in names}
+        grid: Any = {k: None if part is None else part.float().numpy() for k, part in parts.items()}
+        return Plan.of_grid(
+            **grid, size=size, samples=view.samples, **_form_of(sample, view.layout, form)
+        )
+    if prepared.points is None:
+        raise ValueError("the model takes images as they are: it needs no plan")
+    points = prepared.points[0].double().numpy()
+    reads = points.shape[1] // view.size[1] if isinstance(view, PixelView) and view.size else 1
+    return Plan.of_points(
+        points, size, tiles=view.count, reads=reads, **_form_of(sample, "image", form)
+    )
 
 
-def _every_pixel(model: Model, size: Pair) -> _Reading:
-    """The points of a model that takes images of (H, W) as they are."""
-    y, x = (torch.arange(side, dtype=torch.float64) for side in size)
-    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
-    return _Reading(points, "image", None, model.in_chans, model.mean, model.std)
+def _every_pixel(model: Model, size: Pair, form: _Form) -> Plan:
+    """The plan of a model that takes images of (H, W) as they are."""
+    y, x = (np.arange(side, dtype=np.float64) for side in size)
+    return Plan.of_points(np.stack(np.meshgrid(x, y), -1), size, **_form_of(model, "image", form))
 
 
-def _plan_of(
-    sample: nn.Module,
-    found: _Reading,
-    size: Pair,
-    output: Output,
-    mean: float | Sequence[float] | None,
-    std: float | Sequence[float] | None,
-) -> Plan:
+def _form_of(sample: Any, usual: Output, form: _Form) -> dict[str, Any]:
+    """The output, mean and std of a plan. They are those of the model or the view by default."""
+    output, mean, std = form
+    output = output or usual
     if output == "uint8":
-        found = found._replace(mean=0.0, std=1.0)
-    mean, std = found.mean if mean is None else mean, found.std if std is None else std
+        mean, std = 0.0 if mean is None else mean, 1.0 if std is None else std
+    mean, std = sample.mean if mean is None else mean, sample.std if std is None else std
     if mean is None or std is None:
         raise ValueError(
             f"this {type(sample).__name__} does not say how frames are normalised: give the mean "
             "and the std of its network"
         )
-    channels = found.channels or max(np.size(mean), np.size(std))
-    form: dict[str, Any] = dict(
-        output=output,
-        mean=per_channel("mean", mean, channels),
-        std=per_channel("std", std, channels),
-    )
-    points: Any = found.points
-    if found.samples is None:
-        points = points.double().numpy()
-        return Plan.of_points(points, size, tiles=found.tiles, reads=found.reads, **form)
-    names = ("radii", "azimuths", "center", "affine", "offsets")
-    parts = {name: getattr(points, name) for name in names}
-    grid: Any = {k: None if part is None else part.float().numpy() for k, part in parts.items()}
-    return Plan.of_grid(**grid, size=size, samples=found.samples, **form)
+    channels = (isinstance(sample, Model) and sample.in_chans) or max(np.size(mean), np.size(std))
+    mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
+    return dict(output=output, mean=mean, std=std)

@@ -156,11 +156,11 @@ class FastStage(nn.Module):
         else:
             self.constant = [bias().contiguous() for bias in biases]
 
-    def tables(self, points: PolarGrid | Tensor | None) -> Sequence[Tensor]:
+    def tables(self, grid: PolarGrid | None) -> Sequence[Tensor]:
         """As `Stage.tables`, contiguous."""
         if not self.heads:
             return self.constant
-        tables = self.table(self.angles(points)).split(self.heads, 1)
+        tables = self.table(self.angles(grid)).split(self.heads, 1)
         return [table.contiguous() for table in tables]
 
     def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:

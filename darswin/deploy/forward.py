@@ -15,8 +15,9 @@ from darswin.lens.pixels import OUTSIDE
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import RAYS, DistanceHead, PixelHead
+from darswin.models.prepared import Prepared
 from darswin.models.unet import PatchExpand, Unet
-from darswin.views import PixelGrid, PolarView, Prepared
+from darswin.views import PolarView
 from darswin.views.base import Pair
 
 Run = Callable[[Tensor, Prepared, Tensor | None], Any]
@@ -93,18 +94,18 @@ class _UnetRun:
         inputs = [x.float(), *chain(*prepared.tables), *_place_maps(self.places, prepared)]
         if view.in_pixels:
             (logits,) = RUN([*inputs, *rays], self.weights, self.words)
-            pixels = view.back(logits.permute(0, 3, 1, 2), prepared)
-            return unet.head.finish(pixels, prepared.shown)
+            pixels = view.back(logits.permute(0, 3, 1, 2), prepared.view)
+            return unet.head.finish(pixels, prepared.view.shown)
         (maps,) = RUN(inputs, self.weights, self.words)
-        pixels = view.back(maps, prepared)
+        pixels = view.back(maps, prepared.view)
         if unet.refines_with_images:
             assert images is not None
             images = view.floating(images, torch.float32)
             refuse_gradients(images)
             given = [pixels.permute(0, 2, 3, 1), images.float(), *rays]
-            (logits,) = RUN(given, self.weights, self._of_head(prepared.size))
+            (logits,) = RUN(given, self.weights, self._of_head(prepared.view.size))
             pixels = logits.permute(0, 3, 1, 2)
-        return unet.head.finish(pixels, prepared.shown)
+        return unet.head.finish(pixels, prepared.view.shown)
 
 
 def _share(model: Model, weights: Weights) -> None:
@@ -135,7 +136,7 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
     seen = program.input(*_seen(model))
     reads_frame = isinstance(model, Unet) and model.refines_with_images
     if reads_frame:
-        frame = program.input(*prepared.size, _channels(model))
+        frame = program.input(*prepared.view.size, _channels(model))
     tables = _tables(program, model)
     if not isinstance(model, Unet):
         results = _results(program, model, seen, tables)
@@ -144,18 +145,18 @@ def frame_program(model: Model, prepared: Prepared) -> FrameProgram:
         constants += _place_maps(_place_layers(model), prepared)
         if prepared.rays is not None:
             constants.append(prepared.rays)
-        of_rays = prepared.size if reads_frame else seen.shape[1:]
+        of_rays = prepared.view.size if reads_frame else seen.shape[1:]
         rays = _rays(program, model, of_rays)
         x = carried(program, model, seen, tables, places)
         if model.view.in_pixels:
             x = _refined_view(program, model, x, seen, rays)
-        x = _back(program, model.view, x, prepared, constants)
+        x = _back(program, model.view, x, prepared.view, constants)
         if reads_frame:
             pixels = program.joined(frame, *(program.channels_last(of) for of in rays))
             x = refined(program, model.head, x, pixels)
         if isinstance(model.head, DistanceHead):
             x = program.distance(x, model.head.typical_distance)
-            x = _shown_alone(program, x, prepared, constants)
+            x = _shown_alone(program, x, prepared.view, constants)
         results = [program.channels_first(x)]
     for slot in results:
         program.output(slot)
@@ -171,12 +172,10 @@ def _refined_view(program: Program, unet: Unet, x: Slot, seen: Slot, rays: Seque
     return refined(program, unet.head, x, pixels)
 
 
-def _back(
-    program: Program, view: Any, x: Slot, prepared: Prepared, constants: list[Tensor]
-) -> Slot:
+def _back(program: Program, view: Any, x: Slot, prepared: Any, constants: list[Tensor]) -> Slot:
     """A map of the network → the pixels of the images."""
     back = prepared.back
-    if isinstance(back, PixelGrid):
+    if isinstance(view, PolarView):
         assert back.plan is not None
         constants.append(back.plan)
         return program.to_image(x, program.input(*back.plan.shape[1:]))
@@ -189,7 +188,7 @@ def _back(
     return program.sampled(x, program.input(*points.shape[1:]))
 
 
-def _shown_alone(program: Program, x: Slot, prepared: Prepared, constants: list[Tensor]) -> Slot:
+def _shown_alone(program: Program, x: Slot, prepared: Any, constants: list[Tensor]) -> Slot:
     """A map of the pixels of the images with 0 where the view shows nothing."""
     shown = prepared.shown
     if shown is None or shown.all():

@@ -22,8 +22,8 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
+from darswin.models.prepared import Prepared
 from darswin.ops import _module
-from darswin.views import Prepared
 from darswin.views.base import Pair
 
 __all__ = ["optimize"]

@@ -122,11 +122,11 @@ class Stage(nn.Module):
         self.downsample = downsample
         self.blocks = nn.ModuleList(blocks)
 
-    def tables(self, points: PolarGrid | Tensor | None) -> Sequence[Tensor]:
+    def tables(self, grid: PolarGrid | None) -> Sequence[Tensor]:
         """The position biases of all blocks, (B or 1, heads, 2·M_r-1, 2·M_φ-1) each.
 
         Args:
-            points: the `Prepared.points` of the view.
+            grid: that of a polar view, of which the biases of angles depend.
         """
         attentions: list[Any] = [block.attn for block in self.blocks]
         biases = [attn.position_bias for attn in attentions]
@@ -134,7 +134,7 @@ class Stage(nn.Module):
         if not relative:
             return [bias() for bias in biases]
         # One computation for all blocks, because each step handles only a few numbers.
-        table = relative[0].table(attentions[0].angles(points), **joined_coefficients(relative))
+        table = relative[0].table(attentions[0].angles(grid), **joined_coefficients(relative))
         return table.split([bias.heads for bias in relative], 1)
 
     def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:

@@ -10,7 +10,8 @@ from torch.utils import _pytree as pytree
 from darswin.lens import Lens
 from darswin.models.base import Model, check_given_once
 from darswin.models.detections import detections_to_images, find_detections
-from darswin.views import PixelView, Prepared, View, make_view
+from darswin.models.prepared import Prepared
+from darswin.views import PixelView, View, make_view
 from darswin.views.base import Pair, PerChannel, size_of
 from darswin.views.remap import Remaps
 
@@ -22,7 +23,7 @@ class LensAdapter(Model[Any]):
 
     - maps, results with 4 dimensions (B, K, H', W') for any size, are resampled to (B, K, H, W).
       Maps of integers, such as ids, take the nearest value. Pixels that the view does not show get
-      0; `adapter.prepare(lens, size).shown` is their mask;
+      0; `adapter.prepare(lens, size).view.shown` is their mask;
     - detections, a dict of "boxes", "scores" and "labels" or a list of such dicts for each picture,
       as torchvision returns them, become a list with a dict for each image: boxes in pixels of the
       images, and "rays" (K, 3), the directions of their middles, and "visible" (K,), the share of
@@ -115,7 +116,7 @@ class LensAdapter(Model[Any]):
 
         def to_images(out: Any) -> Any:
             has_pixels = isinstance(out, Tensor) and out.dim() == 4
-            return self.view.back(out, prepared) if has_pixels else out
+            return self.view.back(out, prepared.view) if has_pixels else out
 
         return pytree.tree_map(to_images, results)
 

@@ -12,10 +12,16 @@ from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.transformer import Block, Stage
 from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
+from darswin.models.prepared import Prepared
 from darswin.ops._library import transformed
 from darswin.ops.checks import per_channel, readable
-from darswin.views import Prepared, View, make_view
-from darswin.views.base import Pair, PerChannel, check_images, check_one_picture
+from darswin.views import View, make_view
+from darswin.views.base import (
+    Pair,
+    PerChannel,
+    check_images,
+    check_one_picture,
+)
 
 Result = TypeVar("Result", covariant=True)
 
@@ -81,7 +87,7 @@ class Model(nn.Module, Generic[Result]):
     def forward(self, images: Tensor, lens: Lens | None = None) -> Result:
         """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
         images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         return self.forward_network(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
@@ -97,11 +103,13 @@ class Model(nn.Module, Generic[Result]):
             TypeError: the lens is missing, and the model uses one.
             ValueError: the lens belongs to images of another size.
         """
-        prepared = self.view.prepare(
-            lens, size, back=self.goes_back, rays=self.reads_rays, maps=self.token_maps
+        prepared = self.view.prepare(lens, size, back=self.goes_back)
+        return Prepared(
+            prepared,
+            rays=self.view.ray_channels(lens, size) if self.reads_rays else None,
+            tokens=[self.view.token_positions(lens, of_map) for of_map in self.token_maps],
+            tables=[stage.tables(prepared.grid) for stage in self.stages],
         )
-        tables = [stage.tables(prepared.points) for stage in self.stages]
-        return prepared._replace(tables=tables)
 
     def run(self, images: Tensor, prepared: Prepared) -> Result:
         """The result of `forward`, with the lens given as the result of `prepare`.
@@ -118,7 +126,7 @@ class Model(nn.Module, Generic[Result]):
         """
         self._check_learning(prepared)
         images = self._checked(images)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         return self.forward_network(x, prepared, images)
 
     def sample(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -133,7 +141,7 @@ class Model(nn.Module, Generic[Result]):
         Raises:
             TypeError, ValueError: as in `run`.
         """
-        return self.view.see(self._checked(images), prepared, self.dtype)
+        return self.view.see(self._checked(images), prepared.view, self.dtype)
 
     def run_sampled(
         self, sampled: Tensor, prepared: Prepared, images: Tensor | None = None
@@ -151,7 +159,7 @@ class Model(nn.Module, Generic[Result]):
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
         self._check_learning(prepared)
-        sampled = self.view.check_seen(sampled, prepared, self.in_chans)
+        sampled = self.view.check_seen(sampled, prepared.view, self.in_chans)
         self._check_device("sampled", sampled)
         if self.view.in_pixels:
             self._check_dtype("sampled", sampled)

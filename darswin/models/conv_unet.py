@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from darswin.models.base import check_given_once, view_of_model
 from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, with_rays
+from darswin.models.prepared import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.utils.tasks import PixelTask
-from darswin.views import Prepared, View
+from darswin.views import View
 from darswin.views.base import Pair, PerChannel, check_count
 
 # About as many parameters as "darswin_unet_a" of the same size.
@@ -122,4 +123,4 @@ class ConvUnet(PixelModel):
             x = F.interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
             x = block(torch.cat((x, skip), 1))
         logits = self.head.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        return self.head.finish(self.view.back(logits, prepared), prepared.shown)
+        return self.head.finish(self.view.back(logits, prepared.view), prepared.view.shown)

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from darswin import boxes as of_boxes
-from darswin.views import PolarGrid, Prepared, Remap, View
+from darswin.models.prepared import Prepared
+from darswin.views import PixelView, Remap, View
 
 NAMES = ("boxes", "scores", "labels")
 
@@ -63,7 +64,7 @@ def detections_to_images(
         ValueError: boxes, scores and labels do not fit together, the view is polar, or there are
             masks of tiles.
     """
-    if isinstance(prepared.points, PolarGrid):
+    if not isinstance(view, PixelView):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
     if prepared.remaps is None:
         raise ValueError("detections cannot come back inside a graph: compile the network alone")
@@ -74,7 +75,7 @@ def detections_to_images(
         carried = [_carried(part, tile) for part, tile in zip(tiles, remap.tiles, strict=True)]
         joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
         if "masks" in joined:
-            joined["masks"] = _masks_in_image(joined["masks"], view, prepared, k)
+            joined["masks"] = _masks_in_image(joined["masks"], view, prepared.view, k)
         seen = joined["visible"] > 0
         joined = {name: value[seen] for name, value in joined.items()}
         if view.count > 1:
@@ -84,11 +85,11 @@ def detections_to_images(
     return results
 
 
-def _masks_in_image(masks: Tensor, view: View, prepared: Prepared, image: int) -> Tensor:
+def _masks_in_image(masks: Tensor, view: View, prepared: Any, image: int) -> Tensor:
     """Masks (K, 1, H', W') of one picture in the pixels of its image, (K, 1, H, W)."""
     if view.count > 1:
         raise ValueError("masks of tiles cannot come back: choose a view of one picture")
-    if isinstance(prepared.back, Tensor):
+    if prepared.back is not None:
         number, around = min(image, len(prepared.back) - 1), prepared.around
         if around is not None and len(around) > 1:
             around = around[number : number + 1]

@@ -11,8 +11,8 @@ from darswin.layers.transformer import Block, PatchMerging, Stage
 from darswin.lens import Lens
 from darswin.models.base import Model, init_weights
 from darswin.models.features import FeatureInfo, feature_info, take_indices
+from darswin.models.prepared import Prepared
 from darswin.models.stages import StageSizes
-from darswin.views import Prepared
 from darswin.views.base import Pair
 
 Format = Literal["NHWC", "NCHW"]
@@ -172,7 +172,7 @@ class Encoder(Model[Tensor]):
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map after the norm."""
         images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         return self.norm(self.maps(x, prepared.tables)[-1])
 
     def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
@@ -211,7 +211,7 @@ class Encoder(Model[Tensor]):
         taken = take_indices(len(self.stages), indices)
         _check_format(output_fmt)
         images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared, self.dtype)
+        x = self.view.see(images, prepared.view, self.dtype)
         maps = self.maps(x, prepared.tables, count=max(taken) + 1 if stop_early else None)
         final = maps[-1]
         if len(maps) == len(self.stages) and (norm or not intermediates_only):

@@ -59,7 +59,7 @@ class PixelHead(nn.Module):
         return self.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
     def finish(self, logits: Tensor, shown: Tensor | None = None) -> Tensor:
-        """Logits (B, K, H, W) → the model's result; shown: see `Prepared`."""
+        """Logits (B, K, H, W) → the model's result; shown: see `PreparedPixels`."""
         return logits
 
     def extra_repr(self) -> str:

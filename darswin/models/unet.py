@@ -13,10 +13,10 @@ from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import RAYS, PixelModel, with_rays
+from darswin.models.prepared import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.swin import Swin
 from darswin.utils.tasks import PixelTask
-from darswin.views import Prepared
 from darswin.views.base import Pair
 from darswin.views.pixels import resized
 
@@ -98,7 +98,7 @@ class Unet(PixelModel):
     The result has the height and the width of the images. For "segmentation" it is logits (B,
     num_classes, H, W); for "distance" it is metres along the ray, (B, 1, H, W). Where the view
     shows nothing, distances are 0, for unknown, and logits have no meaning: there,
-    `model.prepare(lens, size).shown` is False.
+    `model.prepare(lens, size).view.shown` is False.
 
     The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
     projected to `skip_width` channels and resampled to the pixels. A few convolutions, which also
@@ -213,11 +213,11 @@ class Unet(PixelModel):
         if self.view.in_pixels:
             carried = resized(carried.permute(0, 3, 1, 2), x.shape[2:])
             logits = head.refine(carried, with_rays(x, prepared.rays))
-            return head.finish(self.view.back(logits, prepared), prepared.shown)
-        carried = self.view.back(carried, prepared)
+            return head.finish(self.view.back(logits, prepared.view), prepared.view.shown)
+        carried = self.view.back(carried, prepared.view)
         if images is not None:
             images = with_rays(self.view.floating(images, self.dtype), prepared.rays)
-        return head.finish(head.refine(carried, images), prepared.shown)
+        return head.finish(head.refine(carried, images), prepared.view.shown)
 
     def _with_places(self, maps: Sequence[Tensor], tokens: Sequence[Tensor]) -> list[Tensor]:
         """The encoder's maps, plus a linear function of the positions of their tokens."""

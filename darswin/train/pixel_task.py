@@ -122,9 +122,9 @@ class PixelModule(TaskModule):
         alone it has an answer."""
         prepared = self.net.prepare(lens, (images.shape[2], images.shape[3]))
         predicted = self.net.run(images, prepared).float()
-        if prepared.shown is None:
+        if prepared.view.shown is None:
             return predicted, predicted.new_ones(1, 1, 1, dtype=torch.bool)
-        return predicted, prepared.shown.to(predicted.device)
+        return predicted, prepared.view.shown.to(predicted.device)
 
     def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
         images, lens, target = batch

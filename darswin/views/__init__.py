@@ -6,7 +6,6 @@ import pkgutil
 from darswin.views.base import (
     PixelGrid,
     PolarGrid,
-    Prepared,
     View,
 )
 from darswin.views.camera import CameraView
@@ -41,7 +40,6 @@ __all__ = [
     "PlainView",
     "PolarGrid",
     "PolarView",
-    "Prepared",
     "RayView",
     "Remap",
     "SquareView",

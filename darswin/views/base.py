@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -55,48 +55,60 @@ class PixelGrid(NamedTuple):
     plan: Tensor | None = None
 
 
-def in_full_precision(prepare: Callable[..., "Prepared"]) -> Callable[..., "Prepared"]:
-    """`prepare` of a view without autocast, whose matrix products would move points by pixels."""
-
-    @functools.wraps(prepare)
-    def run(self: Any, lens: Lens | None, size: Pair, **options: Any) -> Prepared:
-        # Where autocast is off, there is no context: a graph would get one of its own.
-        if not isinstance(lens, Lens) or autocast_dtype(lens.theta_max) is None:
-            return prepare(self, lens, size, **options)
-        with torch.autocast(lens.theta_max.device.type, enabled=False):
-            return prepare(self, lens, size, **options)
-
-    return run
-
-
-class Prepared(NamedTuple):
-    """Everything of N lenses that a view and a network need, for images of one size.
+class PreparedPixels(NamedTuple):
+    """What a view of pixels needs of N lenses, for images of one size.
 
     - `size`: (H, W) of the images.
-    - `points`: the points at which the view reads the images: a `PolarGrid`, or pixels
-      (N, H', W', 2). None means that the view is the images.
-    - `back`: the points of the view that the pixels of the images show: a `PixelGrid`, or points
-      (N, H, W, 2). None means that the view is the images, or that the way back was not asked for.
-    - `rays`: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
-      the pixels of the view, or of the images if the view has no pixels; 0 where no ray lands.
-    - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
-    - `tables`: for each stage of a network, the position biases of its blocks; a view has none.
+    - `points`: the points at which the view reads the images, k² for each of its pixels, (N, k·H',
+      k·W', 2) px. None means that the view is the images.
+    - `back`: the points of the view that the pixels of the images show, (N, H, W, 2) px. None means
+      that the view is the images, or that the way back was not asked for.
     - `shown`: (N or 1, H, W), True for the pixels of the images that the view shows: elsewhere a
       network has no answer. None means all pixels, or that the way back was not asked for.
     - `around`: (N or 1,), True if the view goes all around, so that its first column follows its
       last. None means that none does.
-    - `remaps`: the `Remap` of each lens, by which detections come back; None without detections.
     """
 
     size: Pair
-    points: PolarGrid | Tensor | None
-    back: PixelGrid | Tensor | None = None
-    rays: Tensor | None = None
-    tokens: Sequence[Tensor] = ()
-    tables: Sequence[Sequence[Tensor]] = ()
+    points: Tensor | None
+    back: Tensor | None = None
     shown: Tensor | None = None
     around: Tensor | None = None
-    remaps: Sequence[Any] | None = None
+
+    @property
+    def grid(self) -> None:
+        """Only a polar view has a polar grid."""
+
+
+class PreparedPolar(NamedTuple):
+    """What a polar view needs of N lenses, for images of one size.
+
+    `size` and `shown` are those of `PreparedPixels`. `grid` is where the view reads the images, and
+    `back` brings polar maps to their pixels; None means that the way back was not asked for.
+    """
+
+    size: Pair
+    grid: PolarGrid
+    back: PixelGrid | None = None
+    shown: Tensor | None = None
+
+
+Prepares = TypeVar("Prepares", bound=Callable[..., Any])
+
+
+def in_full_precision(method: Prepares) -> Prepares:
+    """A method of a view, of a lens and a size, without autocast, whose matrix products would move
+    points by pixels."""
+
+    @functools.wraps(method)
+    def run(self: Any, lens: Lens | None, size: Pair, **options: Any) -> Any:
+        # Where autocast is off, there is no context: a graph would get one of its own.
+        if not isinstance(lens, Lens) or autocast_dtype(lens.theta_max) is None:
+            return method(self, lens, size, **options)
+        with torch.autocast(lens.theta_max.device.type, enabled=False):
+            return method(self, lens, size, **options)
+
+    return cast(Prepares, run)
 
 
 class View(nn.Module):
@@ -137,32 +149,32 @@ class View(nn.Module):
             per_channel("mean", mean, channels), per_channel("std", std, channels)
         self.mean, self.std = mean, std
 
-    def prepare(
-        self,
-        lens: Lens | None,
-        size: Pair,
-        *,
-        back: bool | Pair = True,
-        rays: bool = True,
-        maps: Sequence[Pair] = (),
-    ) -> Prepared:
-        """Everything that depends on the lens but not on the pixels.
+    def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> Any:
+        """Everything of N lenses that `see` and `back` need, a `PreparedPixels` or `PreparedPolar`.
 
         Args:
             lens: N lenses, or None if the view ignores its lens.
             size: (H, W) of the images.
-            back: whether `Prepared.back` is computed; or the size of the maps that go back, if they
+            back: whether the way back is prepared; or the size of the maps that go back, if they
                 are not of the size of what the network sees.
-            rays: whether `Prepared.rays` is computed.
-            maps: the sizes of the maps for `Prepared.tokens`.
 
         Raises:
-            TypeError: the lens is missing, and the view uses one or the rays are asked for.
+            TypeError: the lens is missing, and the view uses one.
             ValueError: the lens belongs to images of another size.
         """
         raise NotImplementedError
 
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+    def ray_channels(self, lens: Lens | None, size: Pair) -> Tensor:
+        """The viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of the
+        pixels of the view, or of the images if the view has no pixels; 0 where no ray lands. Errors
+        are those of `prepare`, also for a view that ignores its lens."""
+        raise NotImplementedError
+
+    def token_positions(self, lens: Lens | None, size: Pair) -> Tensor:
+        """The positions of the tokens of a map of this size, (N or 1, H', W', `coordinates`)."""
+        raise NotImplementedError
+
+    def see(self, images: Tensor, prepared: Any, dtype: torch.dtype = torch.float32) -> Tensor:
         """Images (B, C, H, W) → what the network sees of them, in floating point.
 
         Args:
@@ -171,8 +183,8 @@ class View(nn.Module):
         """
         raise NotImplementedError
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        """A map of the network → the pixels of the images, (B, K, H, W); 0 unless `Prepared.shown`.
+    def back(self, maps: Tensor, prepared: Any) -> Tensor:
+        """A map of the network → the pixels of the images, (B, K, H, W); 0 unless `shown`.
 
         Args:
             maps: (B, K, H', W') if the view is `in_pixels`, else (B, R, A, K). Values between
@@ -180,7 +192,7 @@ class View(nn.Module):
         """
         raise NotImplementedError
 
-    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+    def check_seen(self, seen: Tensor, prepared: Any, channels: int | None) -> Tensor:
         """The result of `see` for images with C channels; TypeError or ValueError otherwise."""
         raise NotImplementedError
 
@@ -195,8 +207,7 @@ class View(nn.Module):
         """
         images = check_images(images, channels_last)
         height, width = images.shape[2:]
-        prepared = self.prepare(lens, (height, width), back=False, rays=False)
-        return self.see(images, prepared)
+        return self.see(images, self.prepare(lens, (height, width), back=False))
 
     def floating(self, images: Tensor, dtype: torch.dtype) -> Tensor:
         """The images in floating point: uint8 images are normalized, others stay as they are."""

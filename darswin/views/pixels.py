@@ -14,7 +14,7 @@ from darswin.ops.checks import check_pair, tensor_there
 from darswin.views.base import (
     Pair,
     PerChannel,
-    Prepared,
+    PreparedPixels,
     View,
     check_count,
     check_lens,
@@ -124,28 +124,25 @@ class PixelView(View):
     # -- of N lenses ----------------------------------------------------------------------------
 
     @in_full_precision
-    def prepare(
-        self,
-        lens: Lens | None,
-        size: Pair,
-        *,
-        back: bool | Pair = True,
-        rays: bool = True,
-        maps: Sequence[Pair] = (),
-    ) -> Prepared:
-        if self.uses_lens or rays:
+    def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> PreparedPixels:
+        if self.uses_lens:
             check_lens(lens, size)
         points = self.image_points(lens, size)
-        places = self.shown_points(lens, size) if back else None
-        return Prepared(
-            size,
-            points,
-            places,
-            ray_channels(*self.pixel_rays(lens, size)) if rays else None,
-            [_centers(of_map, None if points is None else points.device) for of_map in maps],
-            shown=None if places is None else places[..., 0] != OUTSIDE,
-            around=self.goes_around(lens, size) if back else None,
-        )
+        if not back:
+            return PreparedPixels(size, points)
+        places = self.shown_points(lens, size)
+        shown = None if places is None else places[..., 0] != OUTSIDE
+        return PreparedPixels(size, points, places, shown, self.goes_around(lens, size))
+
+    @in_full_precision
+    def ray_channels(self, lens: Lens | None, size: Pair) -> Tensor:
+        return ray_channels(*self.pixel_rays(check_lens(lens, size), size))
+
+    def token_positions(self, lens: Lens | None, size: Pair) -> Tensor:
+        """The centres of the tokens, (1, H', W', 2): x and y in [-1, 1]."""
+        device = lens.theta_max.device if self.uses_lens and lens is not None else None
+        y, x = ((2 * torch.arange(side, device=device) + 1) / side - 1 for side in size)
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 
     def shown_points(self, lens: Any, size: Pair) -> Tensor | None:
         """`view_points`, with `OUTSIDE` beyond the edges of the view."""
@@ -158,30 +155,31 @@ class PixelView(View):
         return torch.where(within.all(-1, keepdim=True), points, OUTSIDE)
 
     def goes_around(self, lens: Any, size: Pair) -> Tensor | None:
-        """`Prepared.around`."""
+        """`PreparedPixels.around`."""
         return None
 
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+    def see(
+        self, images: Tensor, prepared: PreparedPixels, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         images = self.floating(images, dtype)
         if prepared.points is None:
             return images
-        assert isinstance(prepared.points, Tensor)
         check_count(prepared.points.shape[0], images)
         seen = sample_at(images, prepared.points)
         assert self.size is not None
         reads = prepared.points.shape[2] // self.size[1]
         return seen if reads == 1 else F.avg_pool2d(seen, reads)
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+    def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
         points = self.back_points(prepared, (maps.shape[2], maps.shape[3]))
         if prepared.around is not None:
             maps = torch.cat((maps[..., -1:], maps, maps[..., :1]), -1)
         return sample_at(maps, points)
 
-    def back_points(self, prepared: Prepared, size: Pair) -> Tensor:
+    def back_points(self, prepared: PreparedPixels, size: Pair) -> Tensor:
         """The pixels of a map of this size that `back` brings to the pixels of the images,
         (N, H, W, 2). If a view goes `around`, the map has one more column on each side."""
-        assert isinstance(prepared.back, Tensor)
+        assert prepared.back is not None
         points, around = self.scaled(prepared.back, size), prepared.around
         inner = self.within(points, size)
         if around is not None:
@@ -203,9 +201,9 @@ class PixelView(View):
         """Points of a map, whose outermost pixels extend to its edges."""
         return torch.minimum(points.clamp(min=0), tensor_there(size[::-1], points) - 1)
 
-    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+    def check_seen(self, seen: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
         seen = check_seen_images(seen, self.size or prepared.size, channels)
-        if isinstance(prepared.points, Tensor):
+        if prepared.points is not None:
             check_count(prepared.points.shape[0], seen)
         return seen
 
@@ -216,12 +214,6 @@ class PixelView(View):
 def exact_grid(size: Pair) -> Tensor:
     """The pixels of (H, W), (1, H, W, 2) float64."""
     return pixel_grid(size, torch.zeros((), dtype=torch.float64))
-
-
-def _centers(size: Pair, device: torch.device | None) -> Tensor:
-    """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
-    y, x = ((2 * torch.arange(side, device=device) + 1) / side - 1 for side in size)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 
 
 def resized(maps: Tensor, size: Sequence[int]) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from darswin.lens import Lens, pixels
-from darswin.views.base import Pair, Prepared
+from darswin.views.base import Pair, PreparedPixels
 from darswin.views.pixels import PixelView, exact_grid, resized
 from darswin.views.registry import register_view
 
@@ -46,5 +46,5 @@ class PlainView(PixelView):
     def points_read(self, lens: Any, size: Pair) -> np.ndarray:
         return exact_grid(size)[0].numpy()
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+    def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
         return resized(maps, prepared.size)

@@ -5,7 +5,6 @@ Rings and samples are equal steps of a *spacing*; see `darswin.lens.spacing`.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -30,7 +29,7 @@ from darswin.views.base import (
     PerChannel,
     PixelGrid,
     PolarGrid,
-    Prepared,
+    PreparedPolar,
     View,
     check_count,
     check_lens,
@@ -121,33 +120,34 @@ class PolarView(View):
         self.in_pixels = layout == "image"
 
     @in_full_precision
-    def prepare(
-        self,
-        lens: Lens | None,
-        size: Pair,
-        *,
-        back: bool | Pair = True,
-        rays: bool = True,
-        maps: Sequence[Pair] = (),
-    ) -> Prepared:
+    def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> PreparedPolar:
         lens = check_lens(lens, size)
-        grid = self.pixel_grid(lens, size, self._split(back)) if back else None
-        return Prepared(
-            size,
-            self.grid(lens, size),
-            grid,
-            self._ray_channels(lens, size) if rays else None,
-            [self.token_rays(lens, of_map) for of_map in maps],
-            shown=None if grid is None else shown_by(grid, size),
-        )
+        grid = self.grid(lens, size)
+        if not back:
+            return PreparedPolar(size, grid)
+        pixels = self.pixel_grid(lens, size, self._split(back))
+        return PreparedPolar(size, grid, pixels, shown_by(pixels, size))
 
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
-        assert isinstance(prepared.points, PolarGrid)
-        check_count(prepared.points.radii.shape[0], images)
+    @in_full_precision
+    def ray_channels(self, lens: Lens | None, size: Pair) -> Tensor:
+        lens = check_lens(lens, size)
+        if self.in_pixels:
+            return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
+        return ray_channels(*pixel_rays(lens, size))
+
+    @in_full_precision
+    def token_positions(self, lens: Lens | None, size: Pair) -> Tensor:
+        assert lens is not None
+        return self.token_rays(lens, size)
+
+    def see(
+        self, images: Tensor, prepared: PreparedPolar, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
+        check_count(prepared.grid.radii.shape[0], images)
         # The operator would normalize in float32, and it needs a mean.
         if dtype == torch.float64 or self.mean is None:
             images = self.floating(images, dtype)
-        seen = polar_sample(**self.arguments(images, prepared.points), layout=self.layout)
+        seen = polar_sample(**self.arguments(images, prepared.grid), layout=self.layout)
         # The operator makes float32 of uint8. Pixels go to a network as they are, tokens do not.
         return seen.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else seen
 
@@ -167,8 +167,8 @@ class PolarView(View):
             channels_last=False,
         )  # fmt: skip
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        assert isinstance(prepared.back, PixelGrid)
+    def back(self, maps: Tensor, prepared: PreparedPolar) -> Tensor:
+        assert prepared.back is not None and prepared.shown is not None
         *lens, plan = prepared.back
         if self.in_pixels:
             maps = resized_around(maps, self.map_size).permute(0, 2, 3, 1)
@@ -176,7 +176,7 @@ class PolarView(View):
             places = places_of(maps)
             if self.in_pixels:
                 places = places.permute(0, 3, 1, 2)
-            return nearest(maps, self.back(places, prepared), prepared)
+            return nearest(maps, self.back(places, prepared), prepared.shown)
         dtype = torch.float64 if maps.dtype == torch.float64 else torch.float32
         radii, r_max, center, affine, points = (
             None if tensor is None else tensor.to(maps.device, dtype) for tensor in lens
@@ -190,8 +190,7 @@ class PolarView(View):
         )  # fmt: skip
         return pixels.permute(0, 3, 1, 2)
 
-    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
-        assert isinstance(prepared.points, PolarGrid)
+    def check_seen(self, seen: Tensor, prepared: PreparedPolar, channels: int | None) -> Tensor:
         if self.in_pixels:
             seen = check_seen_images(seen, self.map_size, channels)
         else:
@@ -202,7 +201,7 @@ class PolarView(View):
                 "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})",
                 (None, self.rings, self.sectors, values),
             )  # fmt: skip
-        check_count(prepared.points.radii.shape[0], seen)
+        check_count(prepared.grid.radii.shape[0], seen)
         return seen
 
     @property
@@ -217,11 +216,6 @@ class PolarView(View):
         if self.in_pixels or isinstance(back, bool):  # images of another size are resized
             return self.map_size[0] // self.rings
         return back[0] // self.rings
-
-    def _ray_channels(self, lens: Lens, size: Pair) -> Tensor:
-        if self.in_pixels:
-            return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
-        return ray_channels(*pixel_rays(lens, size))
 
     @property
     def inner_spacing(self) -> Spacing:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from darswin.lens.solve import direction_of, length_of
 from darswin.ops.reference import on_polar_plane
-from darswin.views.base import Pair, PixelGrid, Prepared
+from darswin.views.base import Pair, PixelGrid
 from darswin.views.pixels import resized
 
 
@@ -37,14 +37,13 @@ def places_of(maps: Tensor) -> Tensor:
     return torch.cat((along, ring[:, None, None].expand(-1, sectors, 1)), -1)[None]
 
 
-def nearest(maps: Tensor, there: Tensor, prepared: Prepared) -> Tensor:
+def nearest(maps: Tensor, there: Tensor, shown: Tensor) -> Tensor:
     """The values of polar maps (B, R, A, K) that are nearest to the pixels of the images, whose
-    `places_of` the maps came back as `there`, (N, 3, H, W): (B, K, H, W)."""
-    assert prepared.shown is not None
+    `places_of` the maps came back as `there`, (N, 3, H, W): (B, K, H, W), 0 unless `shown`."""
     _, rings, sectors, channels = maps.shape
     c, s, ring = there.unbind(1)
     column = torch.floor(torch.atan2(s, c) * (sectors / (2 * math.pi))).long() % sectors
     index = (ring.round().long().clamp(0, rings - 1) * sectors + column).flatten(1)
     index = index[:, :, None].expand(maps.shape[0], -1, channels)
-    values = maps.flatten(1, 2).gather(1, index).movedim(2, 1).unflatten(2, prepared.size)
-    return torch.where(prepared.shown.to(maps.device)[:, None], values, 0)
+    values = maps.flatten(1, 2).gather(1, index).movedim(2, 1).unflatten(2, shown.shape[1:])
+    return torch.where(shown.to(maps.device)[:, None], values, 0)

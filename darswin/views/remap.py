@@ -301,7 +301,7 @@ class Remap:
     @cached_property
     def _prepared(self) -> Any:
         with torch.no_grad():
-            return self._bound.prepare(self.lens, self.size, rays=False)
+            return self._bound.prepare(self.lens, self.size)
 
 
 class Remaps(Sequence[Remap]):

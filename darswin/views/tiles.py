@@ -14,7 +14,7 @@ from darswin.utils.angles import degrees_hint
 from darswin.views.base import (
     Pair,
     PerChannel,
-    Prepared,
+    PreparedPixels,
     check_count,
     check_seen_images,
 )
@@ -142,12 +142,14 @@ class TilesView(PixelView):
     def reads_of(self, lens: Lens, size: Pair) -> int:
         return self.tiles[0].reads_of(lens, size)
 
-    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+    def see(
+        self, images: Tensor, prepared: PreparedPixels, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         seen = self.tiles[0].see(images, prepared, dtype)
         return seen.unflatten(2, (self.count, -1)).transpose(1, 2).flatten(0, 1)
 
-    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
-        assert isinstance(prepared.back, Tensor)
+    def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
+        assert prepared.back is not None
         rows = prepared.back[..., 1]
         tile = torch.floor((rows + 0.5) / self.size[0])
         inner = torch.stack((prepared.back[..., 0], rows - tile * self.size[0]), -1)
@@ -157,13 +159,13 @@ class TilesView(PixelView):
         stacked = maps.unflatten(0, (-1, self.count)).transpose(1, 2).flatten(2, 3)
         return sample_at(stacked, torch.where(prepared.back == OUTSIDE, OUTSIDE, points))
 
-    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+    def check_seen(self, seen: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
         seen = check_seen_images(seen, self.size, channels)
         if seen.shape[0] % self.count:
             raise ValueError(
                 f"sampled must have {self.count} tiles for each image, got {seen.shape[0]}"
             )
-        assert isinstance(prepared.points, Tensor)
+        assert prepared.points is not None
         check_count(prepared.points.shape[0], seen[:: self.count])
         return seen
 

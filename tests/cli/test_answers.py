@@ -29,10 +29,12 @@ from darswin.data import FullSize, fitted
 from darswin.data.framing import CutOff
 from darswin.lens import Equidistant, KannalaBrandt, from_dict
 from darswin.lens.pixels import pixel_angles
-from darswin.models.encoder import Encoder, Prepared
+from darswin.models.encoder import Encoder
+from darswin.models.prepared import Prepared
 from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, save_model
 from darswin.train.finetuning import models_for
+from darswin.views.base import PreparedPixels
 from darswin.viz.pixels import UNKNOWN, palette
 
 # A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
@@ -92,7 +94,7 @@ class Stub(Encoder):
     def prepare(self, lens, size):
         assert tuple(lens.image_size[0].tolist()) == size == (48, 48)
         self.prepared += 1
-        return Prepared(None, ())
+        return Prepared(PreparedPixels(size, None))
 
     def run(self, images, prepared, *, stop_after=None):
         images = images.float()

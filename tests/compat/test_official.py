@@ -40,7 +40,7 @@ def differences(name) -> dict[str, float]:
         expected = tensors[key if key == "logits" else f"out.{key}"]
         results[key] = (value.reshape(expected.shape) - expected).abs().max().item()
     # The fixture has every 37th patch, in the order (azimuth, ring), of the transposed image.
-    grid = model.prepare(lens, (64, 64)).points
+    grid = model.prepare(lens, (64, 64)).view.grid
     r, a = grid.radii[:, :, None], grid.azimuths
     xy = torch.stack((r * torch.sin(a), r * torch.cos(a)), -1) / 31.5
     patches = xy.reshape(-1, 16, 10, 64, 10, 2).permute(0, 3, 1, 2, 4, 5).reshape(-1, 1024, 100, 2)

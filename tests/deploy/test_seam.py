@@ -86,7 +86,7 @@ def test_it_does_not_matter_who_samples_the_frame(case):
     prepared = model.prepare(lens, size)
     sampled, result = model.sample(frame, prepared), model(frame, lens)
     assert_same(model.run_sampled(sampled, prepared, frame), result, 1e-5)
-    if prepared.points is None:
+    if not model.view.uses_lens:
         with pytest.raises(ValueError, match="takes images as they are: it needs no plan"):
             camera.plan(model, lens, size)
     else:

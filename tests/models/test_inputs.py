@@ -286,6 +286,6 @@ def test_an_adapter_can_leave_its_results_in_the_view():
     assert [tuple(mask.shape) for mask in pixels["masks"]] == [(2, 3, 40, 48)] * 2
     # The way back of the other adapter brings the map to the pixels.
     back = LensAdapter(nn.Identity(), 32)
-    again = back.view.back(out["masks"][0], back.prepare(lens, (40, 48)))
+    again = back.view.back(out["masks"][0], back.prepare(lens, (40, 48)).view)
     torch.testing.assert_close(again, pixels["masks"][0])
     assert "output='view'" in repr(model)

@@ -46,8 +46,8 @@ def whole(prepared):
 
 def without_sampling(prepared):
     """The gradients of the lens come through the bias alone."""
-    points = PolarGrid(*(None if t is None else t.detach() for t in prepared.points))
-    return prepared._replace(points=points)
+    grid = PolarGrid(*(None if t is None else t.detach() for t in prepared.view.grid))
+    return prepared._replace(view=prepared.view._replace(grid=grid))
 
 
 def without_bias(prepared):
@@ -82,6 +82,6 @@ def test_gradients_are_those_of_finite_differences_and_of_their_two_parts(model,
     known = Spherical.from_fov(values["focal"] / 20, torch.tensor([2.6], dtype=f64), CIRCLE)
     model.requires_grad_(False)
     prepared = model.prepare(known, (32, 32))
-    assert prepared.points.radii.requires_grad
+    assert prepared.view.grid.radii.requires_grad
     assert not any(table.requires_grad for tables in prepared.tables for table in tables)
     model.requires_grad_(True)

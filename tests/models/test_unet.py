@@ -28,7 +28,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     """The decoder has 4 rings per ring of the grid: their centres are samples of a 4 × 4 grid."""
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
-    back = model.prepare(lens, (64, 64)).back
+    back = model.prepare(lens, (64, 64)).view.back
     grid = PolarView(
         rings=16, sectors=64, samples=(4, 4), spacing=spacing, sample_spacing="radius"
     ).grid(lens, (64, 64))
@@ -44,10 +44,11 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 def test_prepare_keeps_a_plan_for_a_single_lens(dtype):
     # A plan in float32 is not for a model in float64.
     model, size = network("darswin_unet_a_nano").to(dtype), (32, 32)
-    assert model.prepare(WIDE[[0, 0]], size).back.plan is None
+    assert model.prepare(WIDE[[0, 0]], size).view.back.plan is None
     prepared = model.prepare(WIDE, size)
-    assert prepared.back.plan.shape == (1, 32, 3, 32)
-    without = prepared._replace(back=prepared.back._replace(plan=None))
+    assert prepared.view.back.plan.shape == (1, 32, 3, 32)
+    back = prepared.view.back._replace(plan=None)
+    without = prepared._replace(view=prepared.view._replace(back=back))
     images = torch.rand(2, 3, 32, 32, dtype=dtype)
     assert torch.equal(model.run(images, prepared), model.run(images, without))
 
@@ -137,7 +138,9 @@ def test_a_lens_is_learned_through_the_way_back(kind, values):
         def loss(*parameters, whole=whole):
             lens = made(*parameters)
             back = model.prepare(lens, size)
-            back = back if whole else prepared._replace(back=back.back, tokens=back.tokens)
+            if not whole:
+                view = prepared.view._replace(back=back.view.back)
+                back = prepared._replace(view=view, tokens=back.tokens)
             logits = model.run(images, back)
             return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
 

@@ -11,12 +11,13 @@ from scenes import write_plain
 from darswin.data import IGNORE
 from darswin.lens import Equidistant, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
+from darswin.models.prepared import Prepared
 from darswin.train import pixel_task
 from darswin.train.distance import Distance, DistanceData
 from darswin.train.pixel_task import Rays
 from darswin.train.results import tables
 from darswin.train.segmentation import AbsentClass, LabelData, Segmentation
-from darswin.views import Prepared
+from darswin.views.base import PreparedPixels
 
 NAME = "darswin_unet_a_nano"
 
@@ -29,7 +30,7 @@ class Constant(torch.nn.Module):
         self.output, self.shown = torch.nn.Parameter(output), shown
 
     def prepare(self, lens, size):
-        return Prepared(size, None, shown=self.shown)
+        return Prepared(PreparedPixels(size, None, shown=self.shown))
 
     def run(self, images, prepared):
         return self.output

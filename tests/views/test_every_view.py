@@ -85,7 +85,7 @@ def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, kind):
     # Single points: the mean of several is not where the ray lands.
     view = make_view(name, size, reads=1 if name in OF_RAYS else None)
     prepared = view.prepare(lens, SIZE)
-    rays = prepared.rays.movedim(1, -1)
+    rays = view.ray_channels(lens, SIZE).movedim(1, -1)
     landed = rays.norm(dim=-1) > 0.5
     torch.testing.assert_close(rays[landed].norm(dim=-1), torch.ones(int(landed.sum())))
     points = lens.project_points(rays.expand(lens.count, -1, -1, -1), SIZE)
@@ -107,10 +107,16 @@ def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, kind):
 def test_autocast_moves_no_point(name, kind):
     view = make_view(name, (32, 40) if name not in ("none", "square") else (48, 48))
     size = (48, 48) if name == "none" else SIZE
-    want = view.prepare(LENSES[kind], size, maps=[(4, 8)])
+
+    def found():
+        lens = LENSES[kind]
+        others = view.ray_channels(lens, size), view.token_positions(lens, (4, 8))
+        return tree_leaves((view.prepare(lens, size), others))
+
+    want = found()
     with torch.autocast("cpu", torch.bfloat16):
-        found = view.prepare(LENSES[kind], size, maps=[(4, 8)])
-    for one, other in zip(tree_leaves(found), tree_leaves(want), strict=True):
+        pairs = zip(found(), want, strict=True)
+    for one, other in pairs:
         if isinstance(one, torch.Tensor):
             torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 
@@ -207,8 +213,8 @@ def test_the_convolutional_unet_sees_pixels_and_rays_of_every_view(name, kind):
     plain.load_state_dict({k.replace("distance", "segmentation"): v for k, v in weights.items()})
     images = torch.rand(lens.count, 3, *SIZE)
     prepared = model.prepare(lens, SIZE)
-    logits = plain.eval()(torch.cat((model.view.see(images, prepared), prepared.rays), 1))
-    expected = model.head.finish(model.view.back(logits, prepared), prepared.shown)
+    logits = plain.eval()(torch.cat((model.view.see(images, prepared.view), prepared.rays), 1))
+    expected = model.head.finish(model.view.back(logits, prepared.view), prepared.view.shown)
     assert torch.equal(model(images, lens), expected)
     assert expected.shape == (lens.count, 1, *SIZE) and expected.std() > 0
     assert torch.equal(model.run_sampled(model.sample(images, prepared), prepared), expected)

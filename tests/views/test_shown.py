@@ -129,7 +129,7 @@ def shift_of(key, view, prepared):
 @pytest.mark.parametrize("key", VIEWS)
 def test_a_map_comes_back_as_loops_compute_it(key):
     view = view_of(key)
-    prepared = view.prepare(LENS, SIZE, rays=False)
+    prepared = view.prepare(LENS, SIZE)
     shift = shift_of(key, view, prepared)
     for scale in SCALES:
         sides = [round(scale * side) for side in view.size]
@@ -150,7 +150,7 @@ def test_a_constant_comes_back_whole_and_ids_stay_ids(name, options):
     if options and name in ("square", "polar"):
         options = {}
     view = make_view(name, (24, 24), **options)
-    prepared = view.prepare(LENS, SIZE, rays=False)
+    prepared = view.prepare(LENS, SIZE)
     shown = prepared.shown[0]
     assert 0.1 < shown.float().mean() < 0.9
     for side in (24, 12, 8, 48):
@@ -222,7 +222,7 @@ def result_of(model, path, images, folder):
 def test_a_dense_model_has_no_answer_where_its_view_shows_nothing(name, view, task, path, tmp_path):
     model = model_of(name, view, task)
     images = torch.randint(256, (1, 3, *SIZE), dtype=torch.uint8)
-    shown = model.prepare(LENS, SIZE).shown[0]
+    shown = model.prepare(LENS, SIZE).view.shown[0]
     result = result_of(model, path, images, tmp_path)
     torch.testing.assert_close(result, model(images, LENS), rtol=1e-3, atol=1e-3)
     assert 0.1 < shown.float().mean() < 0.95 and result[0, :, shown].std() > 0

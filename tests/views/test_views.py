@@ -375,7 +375,7 @@ def test_distances_read_rays_where_there_are_a_lens_and_convolutions(name, optio
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
-    (places,) = PlainView((64, 64)).prepare(None, (64, 64), rays=False, maps=[(2, 4)]).tokens
+    places = PlainView((64, 64)).token_positions(None, (2, 4))
     x, y = torch.tensor([-0.75, -0.25, 0.25, 0.75]), torch.tensor([-0.5, 0.5])
     expected = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
     torch.testing.assert_close(places, expected[None])
