@@ -51,7 +51,7 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
     camera = lens.Perspective.from_fov(FOV, scans.shape[2] / 2)
     # The field of view fills the inscribed circle of the image for every ξ.
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, size / 2)
-    view = CameraView(lenses, (size, size), reads=1)
+    view = CameraView(lenses, (size, size), supersampling=1)
     points = view.image_points(camera.to(torch.float64), scans.shape[1:])  # of all lenses at once
     images = [
         cv2.remap(scan, of_scan, None, cv2.INTER_CUBIC)

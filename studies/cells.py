@@ -12,7 +12,7 @@ POLYNOMIAL = "polynomial"
 DARSWIN = dict(spacing="tan", samples=[10, 10])
 # A perspective view of all that a lens sees, up to 175°.
 END = math.radians(87.5)
-UNDISTORTED = dict(name="perspective", reach=END, theta_max=END, reads=1)
+UNDISTORTED = dict(name="perspective", reach=END, theta_max=END, supersampling=1)
 
 
 @dataclass(frozen=True)

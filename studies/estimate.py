@@ -141,7 +141,7 @@ class Digits:
         self.labels = torch.from_numpy(digits.target[unseen])
         scans = (digits.images[unseen] / 16).astype(np.float32)
         camera = Perspective.from_fov(2 * min(angle(true, CIRCLE), WIDEST), scans.shape[2] / 2)
-        remap = CameraView(self.square(true), reads=1).at(camera, scans.shape[1:])
+        remap = CameraView(self.square(true), supersampling=1).at(camera, scans.shape[1:])
         points = remap.points.astype(np.float32)
         images = [cv2.remap(scan, points, None, cv2.INTER_CUBIC) for scan in scans]
         self.images, self.model = (

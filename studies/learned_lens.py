@@ -84,7 +84,7 @@ def photograph(pictures: np.ndarray, lens: Lens) -> Tensor:
     """Images (N, 1, SIZE, SIZE) of pictures (N, H, W) uint8 through a lens, as in `WideAngle`."""
     camera = Perspective.from_fov(FOV, pictures.shape[1] / 2)
     large = lens.resized(RENDER / SIZE)
-    remap = CameraView(large, (RENDER, RENDER), reads=1).at(camera, pictures.shape[1:])
+    remap = CameraView(large, (RENDER, RENDER), supersampling=1).at(camera, pictures.shape[1:])
     images = [cv2.resize(remap(p), (SIZE, SIZE), interpolation=cv2.INTER_AREA) for p in pictures]
     return torch.from_numpy(np.stack(images))[:, None].float() / (255 * STD)
 

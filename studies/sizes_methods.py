@@ -44,7 +44,7 @@ class Method:
 _CONV, _END = "conv_unet_nano", math.radians(87.5)
 _PLAIN: dict[str, Any] = dict(options=dict(rays=False))
 # A perspective view of all that a lens sees, up to 175°.
-_UNDISTORTED: dict[str, Any] = dict(reach=_END, theta_max=_END, reads=1)
+_UNDISTORTED: dict[str, Any] = dict(reach=_END, theta_max=_END, supersampling=1)
 METHODS = {
     "raw": Method(_CONV, **_PLAIN, uses_lens=False),
     "raw + rays": Method(_CONV),

@@ -28,7 +28,7 @@ def write_frames(
 ) -> Path:
     """The first `count` digits of some classes as frames, in one folder a class."""
     digits, lens = load_digits(), load(calibration).in_picture(size)
-    remap = CameraView(lens, size, reads=1).at(Perspective.from_fov(FOV, 48), (96, 96))
+    remap = CameraView(lens, size, supersampling=1).at(Perspective.from_fov(FOV, 48), (96, 96))
     chosen = [k for k, label in enumerate(digits.target) if str(label) in classes][:count]
     for k in chosen:
         file = folder / str(digits.target[k]) / f"{k}.png"

@@ -52,7 +52,7 @@ def test_every_layout_and_number_of_threads_gives_the_same_bits(called):
     assert not np.array_equal(called(bgr), expected)
 
 
-def test_threads_of_python_may_share_it(called):
+def test_thsupersampling_of_python_may_share_it(called):
     pictures = [frame_of(called, seed) for seed in range(6)]
     expected = [called(picture) for picture in pictures]
     with ThreadPoolExecutor(4) as pool:

@@ -25,7 +25,7 @@ def by_numpy(plan, frame):
         pixels = (pixels / 255 - np.array(plan.mean)) / np.array(plan.std)
     right, lower = plan.right.astype(float), plan.lower.astype(float)
     found = bilinear(pixels, plan.columns + right, plan.rows + lower)
-    if plan.reads > 1:
+    if plan.supersampling > 1:
         found = found.mean(-2)
     if plan.output == "image":
         return np.moveaxis(found, -1, -3)
@@ -68,7 +68,7 @@ def test_pixels_are_the_means_of_their_points(call, threads):
 @pytest.mark.parametrize("name", ["tiles", "mercator", "panorama", "square", "perspective"])
 @pytest.mark.parametrize("output", ["image", "uint8"])
 def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
-    options = {} if name == "square" else dict(reads=2, up=(0.1, -1, 0.2))
+    options = {} if name == "square" else dict(supersampling=2, up=(0.1, -1, 0.2))
     mean, std = (MEAN, STD) if output == "image" else (0.0, 1.0)  # bytes are not normalized
     view = make_view(name, (48, 48), mean=mean, std=std, **options)
     plan = camera.plan(view, LENS, SIZE, output=output)
@@ -82,14 +82,14 @@ def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
     np.testing.assert_allclose(found, seen, atol=3e-3 if output == "image" else 0.6)
     plan.save(tmp_path / "plan.npz")
     again = frames.Plan.load(tmp_path / "plan.npz")
-    assert again == plan and again.reads == plan.reads == (2 if options else 1)
+    assert again == plan and again.supersampling == plan.supersampling == (2 if options else 1)
     np.testing.assert_array_equal(frames.Sampler(again)(frame), found)
 
 
 @pytest.mark.parametrize("name", ["tiles", "mercator", "square", "perspective"])
 @pytest.mark.parametrize("reads", [1, 3])
 def test_points_of_a_plan_are_those_of_the_lens(name, reads):
-    options = {} if name == "square" else dict(reads=reads)
+    options = {} if name == "square" else dict(supersampling=reads)
     view = make_view(name, (200, 240) if name != "square" else (200, 200), mean=0, std=1, **options)
     plan = camera.plan(view, LENS, SIZE)
     points = np.random.default_rng(0).uniform(-0.5, 199.5, (500, 2))
@@ -110,10 +110,10 @@ def test_points_of_a_plan_are_those_of_the_lens(name, reads):
 def test_plans_that_do_not_fit_are_refused():
     places = np.zeros((4, 5, 4), np.int16), np.zeros((4, 5, 4), np.int16)
     parts = np.zeros((4, 5, 4), np.float32), np.zeros((4, 5, 4), np.float32)
-    frames.Sampler(frames.Plan(*places, *parts, (8, 9), "image", reads=2))
+    frames.Sampler(frames.Plan(*places, *parts, (8, 9), "image", supersampling=2))
     for output, reads in (("image", 3), ("image", 0), ("image", 17), ("tokens", 2), ("image", -1)):
         with pytest.raises(ValueError, match="do not fit together"):
-            frames.Sampler(frames.Plan(*places, *parts, (8, 9), output, reads=reads))
+            frames.Sampler(frames.Plan(*places, *parts, (8, 9), output, supersampling=reads))
     with pytest.raises(ValueError, match="tokens has no pixels"):
         tokens = [array.reshape(2, 2, 5, 4) for array in (*places, *parts)]
         frames.Plan(*tokens, (8, 9), "tokens").points(np.zeros((1, 2)))

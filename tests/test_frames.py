@@ -309,12 +309,12 @@ def test_files_of_other_kinds_are_refused(tmp_path):
     for content, words in (
         *((content, r"camera\.npz is no plan") for content in (b"", b"not a plan", b"PK\x03\x04")),
         (dict(other=1), "is no plan"),
-        (dict(darswin_plan=4, something=1), "newer version of darswin"),
+        (dict(darswin_plan=5, something=1), "newer version of darswin"),
         *(
             (dict(vars(PLAN), darswin_plan=k), "older version .* make the plan again")
-            for k in (1, 2)
+            for k in (1, 3)
         ),
-        (dict(darswin_plan=3, size=(1, 2)), "damaged plan"),
+        (dict(darswin_plan=4, size=(1, 2)), "damaged plan"),
     ):
         if isinstance(content, bytes):
             path.write_bytes(content)

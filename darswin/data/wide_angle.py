@@ -72,7 +72,9 @@ class WideAngle(Samples):
         picture = self._square(picture)
         sample = Sample(picture, label, _view(self.fov, len(picture)))
         # A turn leaves the lens as it is, which is round and in the middle.
-        return sample.through(CameraView(self._first_lens(draw), turn=self._turn(draw), reads=1))
+        return sample.through(
+            CameraView(self._first_lens(draw), turn=self._turn(draw), supersampling=1)
+        )
 
     def _view(self, own: Lens, draw: Draw) -> CameraView | CropView:
         if self.lens_augmentation is not None:

@@ -124,9 +124,11 @@ def export_network(
     constants = [np.zeros(0, np.float32), *(one.numpy().ravel() for one in program.constants)]
     is_list = isinstance(model, FeatureMaps)
     finish = "probabilities" if program.is_classifier else "list" if is_list else "array"
+    parts = places.parts()
+    parts["reads"] = parts.pop("supersampling")  # its name in the file
     write_arrays(
         path,
-        {f"plan.{name}": value for name, value in places.parts().items()}
+        {f"plan.{name}": value for name, value in parts.items()}
         | dict(
             darswin_network=_VERSION,
             program=np.array(program.words, np.int64),
@@ -164,9 +166,9 @@ def _plan(
     if prepared.points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
     points = prepared.points[0].double().numpy()
-    reads = points.shape[1] // view.size[1] if isinstance(view, PixelView) and view.size else 1
+    k = points.shape[1] // view.size[1] if isinstance(view, PixelView) and view.size else 1
     return Plan.of_points(
-        points, size, tiles=view.count, reads=reads, **_form_of(sample, "image", form)
+        points, size, tiles=view.count, supersampling=k, **_form_of(sample, "image", form)
     )
 
 

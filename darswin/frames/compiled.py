@@ -37,7 +37,7 @@ class Frames(Protocol):
         scale: Sequence[float],
         offset: Sequence[float],
         output: str,
-        reads: int,
+        supersampling: int,
         /,
     ) -> Sample:
         """A function that samples frames at the places of a plan."""
@@ -62,7 +62,7 @@ class Frames(Protocol):
         """The places of the points of a polar grid: columns, rows, right, lower."""
 
     @staticmethod
-    def read(picture: np.ndarray, points: np.ndarray, reads: int, /) -> np.ndarray:
+    def read(picture: np.ndarray, points: np.ndarray, supersampling: int, /) -> np.ndarray:
         """A picture (H, W, C) of uint8 or float32 at points (k·H', k·W', 2): (H', W', C), each the
         mean of k² points, with 0 outside."""
 

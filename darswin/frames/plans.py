@@ -17,7 +17,7 @@ from darswin.utils.files import replace_file
 from darswin.utils.tables import read_table
 
 Output = Literal["tokens", "image", "uint8"]
-_VERSION = 3
+_VERSION = 4
 _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
 
@@ -32,14 +32,14 @@ class Plan:
         columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
             lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, (H', W') for an
             image, and (n, H', W') for n tiles; a polar image has H' = R·S_r and W' = A·S_φ. If
-            `reads` is above 1, there is a last axis of the points of a pixel, row by row.
+            `supersampling` is above 1, there is a last axis of the points of a pixel, row by row.
         right, lower: the distances of each point from the centre of that pixel, in [0, 1], float32.
         size: (H, W) of the frames.
         output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W') or (n, C, H',
             W'), and "uint8" is (H', W', C) or (n, H', W', C), as OpenCV has it.
         mean, std: normalization `(pixel/255 - mean) / std`, one number for each channel, or one for
             all; "uint8" is not normalized.
-        reads: the points along each side of a pixel, which is their mean. An image only.
+        supersampling: the points along each side of a pixel, which is their mean. An image only.
 
     Raises:
         ValueError: mean and std are not 1 or 3 finite numbers each, or a std is not above 0.
@@ -53,7 +53,7 @@ class Plan:
     output: Output
     mean: tuple[float, ...] = (0.0,)
     std: tuple[float, ...] = (1.0,)
-    reads: int = 1
+    supersampling: int = 1
 
     def __post_init__(self) -> None:
         for name, least in (("mean", -math.inf), ("std", 0.0)):
@@ -77,15 +77,15 @@ class Plan:
         mean: Sequence[float] = (0.0,),
         std: Sequence[float] = (1.0,),
         tiles: int = 1,
-        reads: int = 1,
+        supersampling: int = 1,
     ) -> Self:
         """The plan that reads frames of (H, W) at points.
 
         Args:
-            points: x and y in px, (reads·H', reads·W', 2), or those of tiles below each other; NaN
-                reads nothing.
+            points: x and y in px, (k·H', k·W', 2) with a supersampling of k, or those of tiles
+                below each other; NaN reads nothing.
             tiles: the number of tiles.
-            output, mean, std, reads: as the attributes of a plan.
+            output, mean, std, supersampling: as the attributes of a plan.
 
         Raises:
             ValueError: the output is unknown or tokens, or a side is longer than 32,767 pixels.
@@ -96,10 +96,13 @@ class Plan:
         x, y = points.transpose(2, 0, 1)
         inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
         x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
-        if reads > 1:
-            height, width = (side // reads for side in x.shape)
-            x, y = (v.reshape(height, reads, width, reads).swapaxes(1, 2) for v in (x, y))
-            x, y = (v.reshape(height, width, reads**2) for v in (x, y))
+        if supersampling > 1:
+            height, width = (side // supersampling for side in x.shape)
+            x, y = (
+                v.reshape(height, supersampling, width, supersampling).swapaxes(1, 2)
+                for v in (x, y)
+            )
+            x, y = (v.reshape(height, width, supersampling**2) for v in (x, y))
         if tiles > 1:
             x, y = (v.reshape(tiles, -1, *v.shape[1:]) for v in (x, y))
         columns, rows = np.floor(x), np.floor(y)
@@ -112,7 +115,7 @@ class Plan:
             output=output,
             mean=tuple(mean),
             std=tuple(std),
-            reads=reads,
+            supersampling=supersampling,
         )
 
     @classmethod
@@ -184,18 +187,19 @@ class Plan:
             ValueError: the points have another shape, or the plan has tokens, which have no pixels.
             IndexError: there is no such tile.
         """
-        return read_table(self._tables[tile], (np.asarray(points) + 0.5) * self.reads - 0.5)
+        return read_table(self._tables[tile], (np.asarray(points) + 0.5) * self.supersampling - 0.5)
 
     @cached_property
     def _tables(self) -> np.ndarray:
-        """The places of the points, (n, reads·H', reads·W', 2), NaN outside of the frame."""
+        """The places of the points, (n, k·H', k·W', 2), NaN outside of the frame."""
         if self.output == "tokens":
             raise ValueError("a plan of tokens has no pixels that could be carried to the frame")
         places = np.stack((self.columns + self.right, self.rows + self.lower), -1)
         places[self.columns == _OUTSIDE] = np.nan
-        height, width = self.columns.shape[-2 - (self.reads > 1) :][:2]
-        places = places.reshape(-1, height, width, self.reads, self.reads, 2)
-        return places.swapaxes(2, 3).reshape(-1, height * self.reads, width * self.reads, 2)
+        height, width = self.columns.shape[-2 - (self.supersampling > 1) :][:2]
+        k = self.supersampling
+        places = places.reshape(-1, height, width, k, k, 2).swapaxes(2, 3)
+        return places.reshape(-1, height * k, width * k, 2)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
@@ -242,7 +246,7 @@ class Plan:
                 output=content["output"].item(),
                 mean=tuple(content["mean"].tolist()),
                 std=tuple(content["std"].tolist()),
-                reads=content["reads"].item(),
+                supersampling=content["supersampling"].item(),
             )
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
@@ -314,7 +318,7 @@ class Sampler:
                 plan.columns, plan.rows, plan.right, plan.lower, plan.size,
                 [1 / (255 * std) for std in plan.std],
                 [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
-                plan.output, plan.reads,
+                plan.output, plan.supersampling,
             )  # fmt: skip
         except TypeError as error:
             raise ValueError("the parts of the plan do not fit together") from error

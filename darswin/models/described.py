@@ -54,7 +54,7 @@ def renewed(model: str, options: Mapping[str, Any]) -> tuple[str, dict[str, Any]
         return model, options
     if view == "perspective":  # it showed a circle, up to θ_max of the lens
         end = own.pop("max_fov", math.radians(175)) / 2
-        own |= dict(reach=end, theta_max=end, reads=1)
+        own |= dict(reach=end, theta_max=end, supersampling=1)
     if view == "square" and "theta_max" in own:
         own["fov"] = 2 * own.pop("theta_max")
     options["view"] = dict(name="perspective" if view == "tangent" else view) | own

@@ -10,12 +10,12 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.solve import vector_of
-from darswin.ops.checks import as_int, check_pair, readable
+from darswin.ops.checks import check_pair, readable
 from darswin.views.base import Pair, PerChannel
-from darswin.views.pixels import PixelView
+from darswin.views.pixels import PixelView, check_supersampling
 from darswin.views.turn import STILL, Turn
 
-_MOST_READS, _APART = 5, 1.5  # points along a pixel, and pixels of the picture between them
+_MOST, _APART = 5, 1.5  # points along a pixel, and pixels of the picture between them
 _RADII = 4096  # entries of a table
 _NUDGE = 1e-3  # px, of a radius that is not 0
 _FAR = 1e5  # px, or the multiple of a radius, that leads beyond any picture
@@ -31,8 +31,8 @@ class CameraView(PixelView):
         lens: of the other camera, one lens or one for each image.
         size: (H', W') of its pictures; None means its image_size.
         turn: about the optical axis; the other lens stays as it is.
-        reads: the points along each side of a pixel at which the image is read, 1 to 16. None means
-            an odd number up to 5 that suits the radii of the lenses.
+        supersampling: the points along each side of a pixel at which the image is read, 1 to 16.
+            None means an odd number up to 5 that suits the radii of the lenses.
         mean, std: the arguments of `View`.
 
     Raises:
@@ -47,15 +47,14 @@ class CameraView(PixelView):
         size: Pair | None = None,
         turn: Turn = STILL,
         *,
-        reads: int | None = None,
+        supersampling: int | None = None,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
         size = picture_size(lens) if size is None else check_pair("size", size, 1)
         super().__init__(size, mean=mean, std=std)
-        if reads is not None and not 1 <= (as_int(reads) or 0) <= 16:
-            raise ValueError(f"reads must be an int from 1 to 16, got {reads!r}")
-        self.lens, self.turn, self.reads = lens, turn, reads
+        check_supersampling(supersampling)
+        self.lens, self.turn, self.supersampling = lens, turn, supersampling
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         return vector_of(*self._seen(self._like(lens), points))
@@ -81,11 +80,11 @@ class CameraView(PixelView):
     def camera(self, lens: Lens, size: Pair) -> Lens:
         return self.lens
 
-    def reads_of(self, lens: Lens, size: Pair) -> int:
+    def supersampling_of(self, lens: Lens, size: Pair) -> int:
         if self.reads is not None:
-            return self.reads
+            return self.supersampling
         if not readable(lens.theta_max):
-            raise ValueError("a graph does not know the lens: give the CameraView `reads`")
+            raise ValueError("a graph does not know its lens: give a supersampling to CameraView")
         return points_along((lens.r_max / self.lens.r_max.to(lens.theta_max)).max().item())
 
     def _seen(self, own: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,8 +104,10 @@ class CameraView(PixelView):
     def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
         if not self.lens.is_radial:
             return super().points_read(lens, size)
-        reads = self.reads_of(lens, size)
-        return self._points(lens, size, *(centres(side, reads * side) for side in self.size))
+        supersampling = self.supersampling_of(lens, size)
+        return self._points(
+            lens, size, *(centres(side, supersampling * side) for side in self.size)
+        )
 
     def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
         if not self.lens.is_radial:
@@ -162,7 +163,7 @@ class CameraView(PixelView):
 def points_along(scale: float) -> int:
     """The number of points along a pixel of the view that is as long as `scale` of the picture: an
     odd one, so that one of them is the centre."""
-    return min(_MOST_READS, 2 * math.ceil((scale / _APART - 1) / 2) + 1) if scale > 1 else 1
+    return min(_MOST, 2 * math.ceil((scale / _APART - 1) / 2) + 1) if scale > 1 else 1
 
 
 def picture_size(lens: Lens) -> Pair:

@@ -74,7 +74,7 @@ class CropView(PixelView):
         turn = torch.from_numpy(self.turn.matrix).to(direction.device, direction.dtype)
         return theta, direction @ turn
 
-    def reads_of(self, lens: Lens, size: Pair) -> int:
+    def supersampling_of(self, lens: Lens, size: Pair) -> int:
         return points_along(max(p / s for p, s in zip(self.part[2:], self.size, strict=True)))
 
     def _turned(self, lens: Lens, size: Pair) -> tuple[Lens, np.ndarray]:
@@ -129,8 +129,10 @@ class CropView(PixelView):
         return np.ascontiguousarray(found).reshape(*self.size, *picture.shape[2:])
 
     def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
-        reads = self.reads_of(lens, size)
-        return self._points(lens, size, *(centres(side, reads * side) for side in self.size))
+        supersampling = self.supersampling_of(lens, size)
+        return self._points(
+            lens, size, *(centres(side, supersampling * side) for side in self.size)
+        )
 
     def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
         points = self._points(lens, size, *map(np.arange, self.size))

@@ -11,19 +11,18 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_grid, ray_channels
 from darswin.lens.solve import length_of
-from darswin.ops.checks import as_int, readable, tensor_there
+from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel, check_lens
 from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
-from darswin.views.pixels import PixelView
+from darswin.views.pixels import PixelView, check_supersampling
 
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere
 _STEPS, _BISECTIONS = 361, 12  # points at which the end of what a lens sees is looked for
 _LEAST_STEP = 1e-9  # of a view whose middle the picture does not show
 _SEAM = 1e-3  # px that a view may lack and still goes all around
 _APART = 1.5  # pixels of the image between points at which it is read
-_USUAL_READS = 4  # at most, unless `reads` says more
-MOST_READS = 16  # that a plan of `darswin.frames` can hold
+_USUAL_SUPERSAMPLING = 4  # at most, unless `supersampling` says more
 
 
 class RayView(PixelView):
@@ -46,9 +45,9 @@ class RayView(PixelView):
             it from the roll and pitch of a camera, or from its extrinsics.
         direction: (x, y, z), the middle of the view in the camera's frame, of any length. None
             means the optical axis.
-        reads: the points along each side of a pixel at which the image is read, 1 to 16. None means
-            as many as the sizes of the image and of the view suggest, for a picture that is 180°
-            across.
+        supersampling: the points along each side of a pixel at which the image is read, 1 to 16.
+            None means as many as the sizes of the image and of the view suggest, for a picture that
+            is 180° across.
         mean, std: the arguments of `View`.
 
     Raises:
@@ -71,7 +70,7 @@ class RayView(PixelView):
         *,
         up: Vector | None = None,
         direction: Vector | None = None,
-        reads: int | None = None,
+        supersampling: int | None = None,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
@@ -80,9 +79,8 @@ class RayView(PixelView):
             if angle is not None and not 0 < angle <= most:
                 hint = degrees_hint(angle)
                 raise ValueError(f"{name} must be in (0, {most:.4g}] rad, got {angle}{hint}")
-        if reads is not None and not 1 <= (as_int(reads) or 0) <= MOST_READS:
-            raise ValueError(f"reads must be an int from 1 to {MOST_READS}, got {reads!r}")
-        self.fov, self.theta_max, self.reads = fov, theta_max, reads
+        check_supersampling(supersampling)
+        self.fov, self.theta_max, self.supersampling = fov, theta_max, supersampling
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
@@ -185,12 +183,12 @@ class RayView(PixelView):
         least = -1.0 if self.theta_max is None else math.cos(self.theta_max)
         return rays[..., 2] >= least - 1e-6
 
-    def reads_of(self, lens: Lens, size: Pair) -> int:
+    def supersampling_of(self, lens: Lens, size: Pair) -> int:
         # It must not depend on the values of a lens, which a compiled graph does not have.
         if self.reads is not None:
-            return self.reads
+            return self.supersampling
         shrinks = min(size) / min(self.size) * min(1.0, (self.fov or math.pi) / math.pi)
-        return min(max(math.ceil(shrinks / _APART), 1), _USUAL_READS)
+        return min(max(math.ceil(shrinks / _APART), 1), _USUAL_SUPERSAMPLING)
 
     def _center(self, like: Tensor) -> Tensor:
         return tensor_there([(side - 1) / 2 for side in self.size[::-1]], like)
@@ -276,7 +274,7 @@ class RayView(PixelView):
         return ((pixels >= -0.5) & (pixels <= last)).all(-1)
 
     def extra_repr(self) -> str:
-        shown = dict(fov=self.fov, theta_max=self.theta_max, reads=self.reads)
+        shown = dict(fov=self.fov, theta_max=self.theta_max, supersampling=self.supersampling)
         given = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
         for name, vector, usual in (("up", self.up, PICTURE_TOP),
                                     ("direction", self.direction, AXIS)):  # fmt: skip

@@ -38,12 +38,19 @@ class PerspectiveView(RayView):
         reach: float | None = None,
         up: Vector | None = None,
         direction: Vector | None = None,
-        reads: int | None = None,
+        supersampling: int | None = None,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
         super().__init__(
-            size, fov, theta_max, up=up, direction=direction, reads=reads, mean=mean, std=std
+            size,
+            fov,
+            theta_max,
+            up=up,
+            direction=direction,
+            supersampling=supersampling,
+            mean=mean,
+            std=std,
         )
         if reach is not None and not 0 < reach <= self.widest / 2:
             hint = degrees_hint(reach)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, ray_channels, sample_at
-from darswin.ops.checks import check_pair, tensor_there
+from darswin.ops.checks import as_int, check_pair, tensor_there
 from darswin.views.base import (
     Pair,
     PerChannel,
@@ -24,6 +24,7 @@ from darswin.views.base import (
 from darswin.views.remap import Remap
 from darswin.views.turn import STILL
 
+_MOST = 16  # points along each side of a pixel
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a view is on it
 
 
@@ -84,16 +85,16 @@ class PixelView(View):
         """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
         raise NotImplementedError
 
-    def reads_of(self, lens: Any, size: Pair) -> int:
+    def supersampling_of(self, lens: Any, size: Pair) -> int:
         """k, the points along each side of a pixel at which images of (H, W) are read."""
         return 1
 
     def _finely(self, lens: Any, size: Pair) -> Tensor:
         """k² points in each pixel of the view, (1, k·H', k·W', 2)."""
         assert self.size is not None
-        reads, (height, width) = self.reads_of(lens, size), self.size
-        grid = pixel_grid((height * reads, width * reads), lens.theta_max)
-        return grid if reads == 1 else (grid + 0.5) / reads - 0.5
+        supersampling, (height, width) = self.supersampling_of(lens, size), self.size
+        grid = pixel_grid((height * supersampling, width * supersampling), lens.theta_max)
+        return grid if supersampling == 1 else (grid + 0.5) / supersampling - 0.5
 
     # -- of one lens: what `Remap` asks for -----------------------------------------------------
 
@@ -167,8 +168,8 @@ class PixelView(View):
         check_count(prepared.points.shape[0], images)
         seen = sample_at(images, prepared.points)
         assert self.size is not None
-        reads = prepared.points.shape[2] // self.size[1]
-        return seen if reads == 1 else F.avg_pool2d(seen, reads)
+        supersampling = prepared.points.shape[2] // self.size[1]
+        return seen if supersampling == 1 else F.avg_pool2d(seen, supersampling)
 
     def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
         points = self.back_points(prepared, (maps.shape[2], maps.shape[3]))
@@ -209,6 +210,12 @@ class PixelView(View):
 
     def extra_repr(self) -> str:
         return f"size={self.size}"
+
+
+def check_supersampling(number: int | None) -> None:
+    """ValueError unless a supersampling is None or an int that a plan of frames can hold."""
+    if number is not None and not 1 <= (as_int(number) or 0) <= _MOST:
+        raise ValueError(f"supersampling must be an int from 1 to {_MOST}, got {number!r}")
 
 
 def exact_grid(size: Pair) -> Tensor:

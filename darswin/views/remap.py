@@ -198,8 +198,8 @@ class Remap:
         if picture.dtype in (np.uint8, np.float32) and _module.LACK is None:
             from darswin.frames.compiled import frames
 
-            reads = self.points.shape[1] // self.view_size[1]
-            seen = frames.read(planes, self.points, reads)
+            supersampling = self.points.shape[1] // self.view_size[1]
+            seen = frames.read(planes, self.points, supersampling)
         else:
             images = as_tensor(planes).movedim(2, 0)[None]
             images = images if images.is_floating_point() else images.float()
@@ -227,8 +227,9 @@ class Remap:
             output: "uint8" or "image", see `Plan`.
             mean, std: the normalization of "image"; the default is the view's.
         """
-        from darswin.frames.plans import Plan  # needs the compiled module
+        from darswin.frames.plans import Plan, check_output, check_size  # the compiled module
 
+        check_output(output), check_size(self.size)
         mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
         if output == "uint8":
             mean, std = 0.0, 1.0
@@ -238,7 +239,7 @@ class Remap:
         return Plan.of_points(
             self.points, self.size, output=output, mean=per_channel("mean", mean, channels),
             std=per_channel("std", std, channels), tiles=self.view.count,
-            reads=self.points.shape[1] // self.view_size[1],
+            supersampling=self.points.shape[1] // self.view_size[1],
         )  # fmt: skip
 
     @cached_property

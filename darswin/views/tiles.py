@@ -55,7 +55,7 @@ class TilesView(PixelView):
         tile_fov: the horizontal field of view of a tile, rad; None suits `count` and `fov`.
         directions: (n, 3), the middles of the tiles in the camera's frame, in place of `count`,
             `fov` and `direction`; `tile_fov` must be given too.
-        up, direction, reads: see `RayView`; `direction` is the middle of the whole.
+        up, direction, supersampling: see `RayView`; `direction` is the middle of the whole.
         mean, std: the arguments of `View`.
 
     Raises:
@@ -76,7 +76,7 @@ class TilesView(PixelView):
         directions: Sequence[Vector] | None = None,
         up: Vector | None = None,
         direction: Vector | None = None,
-        reads: int | None = None,
+        supersampling: int | None = None,
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
@@ -103,7 +103,14 @@ class TilesView(PixelView):
             )
         self.tiles = [
             StereographicView(
-                size, tile_fov, theta_max, up=up, direction=middle, reads=reads, mean=mean, std=std
+                size,
+                tile_fov,
+                theta_max,
+                up=up,
+                direction=middle,
+                supersampling=supersampling,
+                mean=mean,
+                std=std,
             )
             for middle in directions
         ]
@@ -139,8 +146,8 @@ class TilesView(PixelView):
         theta, direction = zip(*(tile.pixel_rays(lens, size) for tile in self.tiles), strict=True)
         return torch.cat(theta, 1), torch.cat(direction, 1)
 
-    def reads_of(self, lens: Lens, size: Pair) -> int:
-        return self.tiles[0].reads_of(lens, size)
+    def supersampling_of(self, lens: Lens, size: Pair) -> int:
+        return self.tiles[0].supersampling_of(lens, size)
 
     def see(
         self, images: Tensor, prepared: PreparedPixels, dtype: torch.dtype = torch.float32

@@ -190,12 +190,13 @@ def draw_view(image: np.ndarray, lens: Lens, view: PixelView, *, axes: Axes) -> 
     lens, size = _one(lens), (image.shape[0], image.shape[1])
     remap = view.at(lens, size)
     points, (height, width) = remap.points, remap.view_size
-    reads = points.shape[1] // width
+    supersampling = points.shape[1] // width
     beyond = (points == OUTSIDE).all(-1)
     outside = beyond | ((points < -0.5) | (points > (size[1] - 0.5, size[0] - 0.5))).any(-1)
     # A pixel is hatched if all of its points are.
     beyond, outside = (
-        x.reshape(height, reads, width, reads).all((1, 3)) for x in (beyond, outside)
+        x.reshape(height, supersampling, width, supersampling).all((1, 3))
+        for x in (beyond, outside)
     )
     _show(axes, remap(image), outside)
     x, y = torch.arange(width), torch.arange(height)

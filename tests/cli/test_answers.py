@@ -70,9 +70,9 @@ def test_answers_are_the_models_in_order_whatever_the_lenses(monkeypatch):
     assert len(prepared) == 18 + 1  # the first one was no longer kept
     assert [entry["image"] for entry in answers.found] == list(range(len(order)))
     for entry, image, which in zip(answers.found, images, order, strict=True):
-        pixels, lens = module.resized(model, card, image, lenses[which])
-        assert pixels.shape == (1, 3, 32, 32)
-        expected = model(pixels, lens).softmax(-1)[0]
+        remap = fitted(image.shape[:2], 32, "crop").at(lenses[which], image.shape[:2])
+        pixels = torch.from_numpy(remap(image)[None]).permute(0, 3, 1, 2)
+        expected = model(pixels, remap.camera).softmax(-1)[0]
         assert len(entry["top"]) == 6
         for found in entry["top"]:
             k = "abcdef".index(found["class"])

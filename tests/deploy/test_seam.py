@@ -118,7 +118,7 @@ class Computations(TorchDispatchMode):
 @pytest.mark.parametrize(
     "case", list(map(cost, (case for case in CASES if case.startswith("darswin"))))
 )
-def test_an_optimized_model_leaves_the_threads_of_torch_asleep(case):
+def test_an_optimized_model_leaves_the_thsupersampling_of_torch_asleep(case):
     # They stay awake for milliseconds after each operator, and would compete with our threads.
     model, frame, lens = made(case)
     images = (frame.permute(0, 3, 1, 2) / 255.0).contiguous()

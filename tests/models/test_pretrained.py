@@ -73,7 +73,7 @@ def test_digits_in_picture_files(demo, unseen):
     assert [float(xi) for _, xi in said] == [0, 0.5, 1]
     for percent, xi in said:
         taken_with = Spherical.from_fov(float(xi), demo.FOV, 128)
-        view = CameraView(taken_with, (256, 256), reads=1)
+        view = CameraView(taken_with, (256, 256), supersampling=1)
         points = view.at(Perspective.from_fov(demo.FOV, 4), (8, 8)).points.astype(np.float32)
         taken_with = taken_with.replace(image_size=torch.tensor([[256, 256]]))
         small = []

@@ -126,7 +126,7 @@ def test_a_card_keeps_the_whole_view(tmp_path):
         ModelCard("swin_nano", dict(view=view, mean=0.5))
 
 
-CIRCLE = dict(name="perspective", reach=1.0, theta_max=1.0, reads=1)
+CIRCLE = dict(name="perspective", reach=1.0, theta_max=1.0, supersampling=1)
 WHOLE = dict(CIRCLE, reach=math.radians(87.5), theta_max=math.radians(87.5))
 
 

@@ -233,13 +233,6 @@ def test_changes_are_named():
             ValueError, match=f"cannot change these options: `{name}` {value!r} in place of [^;]*$"
         ):
             check_changes(before, changed)
-    # Of before there were tasks.
-    assert check_changes({}, {"task": "classification"}) == {}
-    with pytest.raises(ValueError, match="`task` 'distance' in place of 'classification'"):
-        check_changes({}, {"task": "distance"})
-    assert (
-        check_changes({"data": {}}, {"data": {"crop": None}, "model": {"freeze_stages": 0}}) == {}
-    )
 
 
 @pytest.mark.parametrize("kind", [Classification, Segmentation])

@@ -175,7 +175,7 @@ def test_image_and_labels_move_together(turn, crop, size, name):
 
 def test_what_is_much_larger_is_averaged():
     parts = [CropView((0, 0, part, part), (20, 20)) for part in (10, 20, 30, 40, 90, 100, 400)]
-    assert [view.reads_of(None, (400, 400)) for view in parts] == [1, 1, 1, 3, 3, 5, 5]
+    assert [view.supersampling_of(None, (400, 400)) for view in parts] == [1, 1, 1, 3, 3, 5, 5]
     lens = Equidistant.from_fov(3.0, 400.0, image_size=(800, 800), center=[399.5, 399.5])
     noise = np.random.default_rng(0).integers(256, size=(800, 800, 1), dtype=np.uint8)
     source = Sample(noise, np.zeros((800, 800), np.uint8), lens)
@@ -428,7 +428,7 @@ def test_other_cameras_of_many():
     images = torch.rand(2, 3, 20, 24)
     source = Spherical.from_fov([0.2, 0.9], 2.0, 10.0)
     target = Perspective.from_fov(1.8, 8.0)
-    view = CameraView(target, (16, 18), reads=1)
+    view = CameraView(target, (16, 18), supersampling=1)
     together = view(images, source)
     assert together.shape == (2, 3, 16, 18)
     for k in range(2):
@@ -448,7 +448,7 @@ def test_a_ray_keeps_its_angles():
     radial = Perspective.from_fov(2.4, 25.0, center=[28.0, 21.5]).to(f64)
     several = Spherical.from_fov([0.2, 0.9], 2.4, 30.0).to(f64)
     for a, b in ((general, tilted), (tilted, general), (radial, several)):
-        found = CameraView(b, (40, 50), reads=1).image_points(a, (46, 64))
+        found = CameraView(b, (40, 50), supersampling=1).image_points(a, (46, 64))
         assert found.shape == (len(b), 40, 50, 2)
         for there, lens in zip(found, b, strict=True):
             seen = there[..., 0] != OUTSIDE
@@ -462,11 +462,11 @@ def test_a_ray_keeps_its_angles():
 def test_gradients_reach_both_lenses_also_at_the_centre_and_where_nothing_is_seen(radial):
     def places(focal, xi, tangential, affine, center):
         if radial:
-            view = CameraView(Spherical(xi, focal, 1.2), (9, 9), reads=1)
+            view = CameraView(Spherical(xi, focal, 1.2), (9, 9), supersampling=1)
             return view.image_points(Perspective(focal, 1.2), (4, 4))
         source = Mei(xi, focal, (0.05, 0.2), 1.2, center, affine=affine, tangential=tangential)
         target = Mei(1.0, focal, None, 1.3, affine=affine, tangential=tangential)
-        return CameraView(target, (9, 9), reads=1).image_points(source, (40, 40))
+        return CameraView(target, (9, 9), supersampling=1).image_points(source, (40, 40))
 
     parameters = [[2.9], [1.5], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
     tensors = [torch.tensor(p, dtype=f64, requires_grad=True) for p in parameters]

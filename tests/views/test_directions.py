@@ -108,7 +108,7 @@ def test_points_go_through_every_lens_and_come_back(name, model):
 
 @every_ray_view
 def test_what_a_view_reads_is_where_its_points_go(name):
-    view = make_view(name, (40, 50), reads=1)
+    view = make_view(name, (40, 50), supersampling=1)
     prepared = view.prepare(WIDE, SIZE)
     grid = np.stack(np.meshgrid(np.arange(50.0), np.arange(40.0)), -1)
     places = view.at(WIDE, SIZE).to_image(grid)
@@ -168,15 +168,17 @@ def test_nothing_is_shown_beyond_theta_max(name):
 @every_ray_view
 def test_pixels_are_means_of_their_points(name):
     image = torch.rand(1, 3, *SIZE)
-    fine = make_view(name, (64, 64), reads=1, **({} if name == "panorama" else dict(fov=1.5)))
+    fine = make_view(
+        name, (64, 64), supersampling=1, **({} if name == "panorama" else dict(fov=1.5))
+    )
     for reads in (2, 3):
         options = {} if name == "panorama" else dict(fov=1.5)
-        mean = make_view(name, (64, 64), reads=reads, **options)(image, WIDE)
-        parts = make_view(name, (64 * reads, 64 * reads), reads=1, **options)(image, WIDE)
+        mean = make_view(name, (64, 64), supersampling=reads, **options)(image, WIDE)
+        parts = make_view(name, (64 * reads, 64 * reads), supersampling=1, **options)(image, WIDE)
         torch.testing.assert_close(mean, F.avg_pool2d(parts, reads), rtol=0, atol=2e-4)
     assert (fine(image, WIDE) - mean).abs().mean() > 0.05
     large, small = (
-        make_view(name, (side, side)).reads_of(WIDE, (1080, 1920)) for side in (720, 128)
+        make_view(name, (side, side)).supersampling_of(WIDE, (1080, 1920)) for side in (720, 128)
     )
     assert (large, small) == (1, 4)
 
@@ -314,8 +316,8 @@ def test_own_directions():
         ("mercator", dict(up=5), "up must be three finite numbers that are not all 0, got 5"),
         ("mercator", dict(up="abc"), "up must be three finite"),
         ("mercator", dict(up=torch.zeros(2, 3)), "up must be three finite"),
-        ("mercator", dict(reads=0), "reads must be an int from 1 to 16, got 0"),
-        ("mercator", dict(reads=17), "reads must be an int from 1 to 16, got 17"),
+        ("mercator", dict(supersampling=0), "supersampling must be an int from 1 to 16, got 0"),
+        ("mercator", dict(supersampling=17), "supersampling must be an int from 1 to 16, got 17"),
         ("tiles", dict(count=3), "count must be from 4 to 9, got 3"),
         ("tiles", dict(fov=-1.0), "fov must be in"),
         ("tiles", dict(count=5.0), "count must be from 4 to 9, got 5.0"),

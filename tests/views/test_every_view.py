@@ -83,7 +83,7 @@ def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, kind):
     lens = LENSES[kind]
     size = SIZE if name == "none" else (24, 24)
     # Single points: the mean of several is not where the ray lands.
-    view = make_view(name, size, reads=1 if name in OF_RAYS else None)
+    view = make_view(name, size, supersampling=1 if name in OF_RAYS else None)
     prepared = view.prepare(lens, SIZE)
     rays = view.ray_channels(lens, SIZE).movedim(1, -1)
     landed = rays.norm(dim=-1) > 0.5

@@ -95,7 +95,7 @@ def test_a_view_shows_what_lies_along_its_rays(make):
         inside = (theta < lens.theta_max - 0.04) & ((there >= 0) & (there <= last)).all(-1)
         assert inside.double().mean() > 0.4, name
         # Bilinear between pixels, of places that OpenCV rounds to 1/32 px.
-        shown = undistort(image, lens, made(*described, reads=1))
+        shown = undistort(image, lens, made(*described, supersampling=1))
         error = np.abs(shown - scene(rays))[inside]
         assert error.max() < 5e-4, name
 
@@ -106,7 +106,7 @@ def test_rays_land_where_the_lens_projects_them(make):
     rays = by_hand(*described)
     theta, azimuth = angles(rays)
     size = tuple(lens.image_size[0].int().tolist())
-    there = made(*described, reads=1).at(lens, size).points
+    there = made(*described, supersampling=1).at(lens, size).points
     beyond = (theta > lens.theta_max).numpy()
     assert 0 < beyond.mean() < 1 and (there[beyond] == OUTSIDE).all()
     expected = lens.project_rays(theta, azimuth).numpy()
@@ -146,14 +146,14 @@ def test_a_view_that_shrinks_is_the_mean_of_areas():
     """As more points have it, and OpenCV's reduction of a flat picture."""
     lens, noise = front(), np.random.default_rng(0).random((966, 1280)).astype(np.float32)
     described = ("perspective", (30, 40), 1.5)
-    fine = undistort(noise, lens, made(described[0], (30 * 16, 40 * 16), 1.5, reads=1))
+    fine = undistort(noise, lens, made(described[0], (30 * 16, 40 * 16), 1.5, supersampling=1))
     means = fine.reshape(30, 16, 40, 16).mean((1, 3))
-    single = np.abs(undistort(noise, lens, made(*described, reads=1)) - means).mean()
+    single = np.abs(undistort(noise, lens, made(*described, supersampling=1)) - means).mean()
     assert np.abs(undistort(noise, lens, made(*described)) - means).mean() < single / 3
     flat = Perspective(60.0, 1.2, image_size=(60, 80))
     picture = (noise[:60, :80] * 255).astype(np.uint8)
     reduced = undistort(
-        picture, flat, made("perspective", (30, 40), 2 * math.atan(40 / 60), reads=2)
+        picture, flat, made("perspective", (30, 40), 2 * math.atan(40 / 60), supersampling=2)
     )
     expected = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA)
     assert reduced.dtype == np.uint8 and np.abs(reduced.astype(int) - expected).max() <= 1

@@ -200,7 +200,7 @@ def scene(size):
 
 @torch.no_grad()
 def reproject(images, own, lens, size):
-    return CameraView(lens, size, reads=1)(images, own)
+    return CameraView(lens, size, supersampling=1)(images, own)
 
 
 def undistorted(picture, lens, **options):
@@ -233,7 +233,7 @@ def test_the_perspective_image_comes_back(xi):
 def test_a_view_reaches_as_far_as_the_lens_up_to_its_limit():
     side, wide = 64, Polynomial([20.0], math.radians(95))
     picture = scene(side)
-    end = dict(theta_max=math.radians(50), reads=1)
+    end = dict(theta_max=math.radians(50), supersampling=1)
     limited = undistorted(picture, wide, reach=math.radians(50), **end)
     narrow = Polynomial([20.0], math.radians(50))
     expected = reproject(

@@ -17,9 +17,9 @@ from darswin.views import SquareView, make_view, turned
 
 VIEWS = {
     "all inside": make_view("perspective", (40, 50), fov=1.4),
-    "beyond": make_view("equirectangular", (30, 60), fov=2 * math.pi, reads=1),
+    "beyond": make_view("equirectangular", (30, 60), fov=2 * math.pi, supersampling=1),
     "turned": make_view("cylindrical", (30, 60), fov=2.0, **turned(0.7, -0.4)),
-    "shrunk": make_view("mercator", (12, 20), fov=3.0, up=(0.3, -1, 0.2), reads=3),
+    "shrunk": make_view("mercator", (12, 20), fov=3.0, up=(0.3, -1, 0.2), supersampling=3),
     "square": SquareView((30, 30), fov=2.6),
 }
 
@@ -30,7 +30,7 @@ def test_plans_of_views_are_exact_pictures(name, channels):
     view, lens, frame = VIEWS[name], ROUND.with_theta_max(1.5), random_frame(64, 70, *channels)
     found = frames.Sampler(camera.plan(view, lens, (64, 70), output="uint8"))(frame)
     assert found.dtype == np.uint8 and found.shape == (*view.size, *channels)
-    reads, exact = view.reads_of(lens, (64, 70)), lens.to(torch.float64)
+    reads, exact = view.supersampling_of(lens, (64, 70)), lens.to(torch.float64)
     assert reads == (3 if name == "shrunk" else 1)
     rows, columns = (np.arange(side * reads) + 0.5 for side in view.size)
     pixels = np.stack(np.meshgrid(columns, rows), -1) / reads - 0.5
@@ -54,8 +54,8 @@ def cv2_view(image, points, size):
     "view",
     [
         make_view("perspective", (60, 80), fov=1.5, **turned(0.2)),
-        make_view("stereographic", (20, 30), fov=2.5, reads=3),
-        make_view("mercator", (17, 25), reads=2),
+        make_view("stereographic", (20, 30), fov=2.5, supersampling=3),
+        make_view("mercator", (17, 25), supersampling=2),
     ],
 )
 def test_views_agree_with_opencv(view):

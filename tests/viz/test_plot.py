@@ -101,11 +101,11 @@ def test_it_is_hatched_where_there_is_no_picture():
     azimuth = torch.atan2(y.sin(), y.cos() * x.sin())
     place = lens.to(torch.float64).project_rays(theta, azimuth, (20, 60))
     seen = (theta <= lens.theta_max) & ((place[..., 1] - 9.5).abs() <= 10)
-    view = make_view("equirectangular", (45, 90), fov=2 * math.pi, reads=1)
+    view = make_view("equirectangular", (45, 90), fov=2 * math.pi, supersampling=1)
     (axes,) = drawn(draw_view, image, lens, view)
     np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
     # With several reads, a pixel is hatched if it reads nothing.
-    view = make_view("equirectangular", (15, 30), fov=2 * math.pi, reads=3)
+    view = make_view("equirectangular", (15, 30), fov=2 * math.pi, supersampling=3)
     (axes,) = drawn(draw_view, image, lens, view)
     some = seen.numpy().reshape(15, 3, 30, 3).any((1, 3))
     np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, some)
