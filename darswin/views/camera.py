@@ -81,7 +81,7 @@ class CameraView(PixelView):
         return self.lens
 
     def supersampling_of(self, lens: Lens, size: Pair) -> int:
-        if self.reads is not None:
+        if self.supersampling is not None:
             return self.supersampling
         if not readable(lens.theta_max):
             raise ValueError("a graph does not know its lens: give a supersampling to CameraView")

@@ -185,7 +185,7 @@ class RayView(PixelView):
 
     def supersampling_of(self, lens: Lens, size: Pair) -> int:
         # It must not depend on the values of a lens, which a compiled graph does not have.
-        if self.reads is not None:
+        if self.supersampling is not None:
             return self.supersampling
         shrinks = min(size) / min(self.size) * min(1.0, (self.fov or math.pi) / math.pi)
         return min(max(math.ceil(shrinks / _APART), 1), _USUAL_SUPERSAMPLING)
