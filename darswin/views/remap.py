@@ -229,7 +229,8 @@ class Remap:
         """
         from darswin.frames.plans import Plan, check_output, check_size  # the compiled module
 
-        check_output(output), check_size(self.size)
+        check_output(output)
+        check_size(self.size)
         mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
         if output == "uint8":
             mean, std = 0.0, 1.0

@@ -62,7 +62,7 @@ def model_of(kind):
         sizes = dict(rings=4, sectors=16, samples=(2, 2))
         return OfficialDarSwin(num_classes=5, **ONE, **sizes).eval()
     if kind == "adapter":
-        return LensAdapter(torch.nn.Conv2d(3, 4, 3, padding=1), SIDE).eval()
+        return LensAdapter(torch.nn.Conv2d(3, 4, 3, padding=1), SIDE, view="square").eval()
     return create(name, **(dict(num_classes=5) | options)).eval()
 
 
