@@ -12,11 +12,13 @@ from frame_samples import LAYOUTS, MEAN, ROUND, STD, bilinear, in_layout, random
 from helpers import CAMERAS
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from lens_examples import RANDOM, random_lens
 
 from darswin import create_model, frames
 from darswin.deploy import camera
 from darswin.frames import _frames
+from darswin.frames.compiled import frames as compiled
 from darswin.lens import Equidistant
 from darswin.models import LensAdapter
 from darswin.views import PolarView, make_view
@@ -336,3 +338,40 @@ def test_raw_calls_are_checked():
             nothing, azimuths[: len(nothing)], np.full(2, math.nan), None, None, (9, 9)
         )
         assert columns.shape == (len(nothing), len(nothing)) and (columns == -3).all()
+
+
+@given(st.data())
+def test_a_picture_is_read_at_any_points(data):
+    """Against weights of the four pixels around each point, in float64."""
+    side, channels, k = (
+        st.integers(1, 5),
+        data.draw(st.integers(1, 4)),
+        data.draw(st.integers(1, 3)),
+    )
+    height, width, rows, columns = (data.draw(side) for _ in range(4))
+    number = st.one_of(
+        st.floats(-3, 8, width=32), st.sampled_from([math.nan, math.inf, -math.inf, 3e38, -1e9])
+    )
+    points = data.draw(arrays(np.float32, (rows * k, columns * k, 2), elements=number))
+    random = np.random.default_rng(data.draw(st.integers(0, 9)))
+    picture = random.integers(0, 256, (height, width, channels), np.uint8)
+    y, x = np.mgrid[:height, :width]
+    with np.errstate(invalid="ignore"):
+        weight = np.clip(1 - np.abs(points[..., 0, None, None].astype(float) - x), 0, None)
+        weight = weight * np.clip(1 - np.abs(points[..., 1, None, None].astype(float) - y), 0, None)
+    expected = np.einsum("ijyx,yxc->ijc", np.nan_to_num(weight), picture.astype(float))
+    expected = expected.reshape(rows, k, columns, k, channels).mean((1, 3))
+    found = compiled.read(picture, points, k)
+    assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 0.5 + 1e-3
+    exact = compiled.read(picture.astype(np.float32), points, k)
+    np.testing.assert_allclose(exact, expected, atol=1e-3)
+
+
+def test_what_cannot_be_read_is_refused():
+    picture, points = np.zeros((3, 4, 1), np.uint8), np.zeros((2, 4, 2), np.float32)
+    for wrong in ((picture[0], points, 1), (picture, points[0], 1), (picture, points, 3),
+                  (picture, points, 0), (picture, points[..., :1], 1)):  # fmt: skip
+        with pytest.raises(ValueError, match="expected a picture"):
+            compiled.read(*wrong)
+    with pytest.raises(TypeError):
+        compiled.read(picture.astype(np.int16), points, 1)
