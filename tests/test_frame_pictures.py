@@ -123,3 +123,10 @@ def test_plans_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="sees nothing of the lens"):
         narrow = make_view("perspective", (8, 8), direction=(0, 0, -1))
         camera.plan(narrow, Equidistant(40.0, 1.5), SIZE)
+
+
+@pytest.mark.parametrize("name", ["perspective", "equirectangular", "square", "tiles"])
+def test_plans_are_exact_for_lenses_in_single_precision_too(name):
+    view = make_view(name, 30)
+    exact = camera.plan(view, LENS.to(torch.float64), SIZE)
+    assert camera.plan(view, LENS, SIZE) == exact == view.at(LENS, SIZE).plan("image")
