@@ -3,8 +3,9 @@
 Boxes (x0, y0, x1, y1), polygons and points have the coordinates of COCO and torchvision: a picture
 covers (0, 0) to (W, H), and pixel i has its centre at i + 1/2. A *point map* is a function from
 points (..., 2) to points (..., 2), NumPy float64, in darswin's pixels, whose centres are integers;
-it gives NaN where nothing is seen. Examples are `Reframing.to_new`, `frames.Plan.points` and a
-view's `to_image`. Tensors give tensors of the same device and dtype, all else gives NumPy arrays.
+it gives NaN where nothing is seen. Examples are `to_view` and `to_image` of a
+`darswin.views.Remap`, and `frames.Plan.points`. Tensors give tensors of the same device and dtype,
+all else gives NumPy arrays.
 
 A box travels as the ellipse inside it: things touch the middles of the sides of their boxes, while
 the corners are mostly empty, so a rectangle would grow with every step.

@@ -1,8 +1,4 @@
-"""All pixels of an image: rays, solid angles, z from distance, and views of other lenses.
-
-A map holds, for each pixel of a target image, the place (x, y) in the source image where the
-pixel's ray lands, (..., 2), and (`OUTSIDE`, `OUTSIDE`) where no ray lands.
-"""
+"""All pixels of an image: rays, solid angles, z from distance, and samples at any points."""
 
 import torch
 import torch.nn.functional as F

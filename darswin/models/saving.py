@@ -40,7 +40,7 @@ class ModelCard:
         classes: the names of the classes, in the order of the logits.
         size: the side of the training images, in pixels.
         fov: the field of view of the training lenses, in rad; 0 if they came from calibrations.
-        fit: the way in which a camera's pictures get this size, as in `darswin.data.at_size`.
+        fit: the way in which a camera's pictures get this size, as in `darswin.data.fitted`.
             "whole" is for models trained through the lenses of `darswin.data.WideAngle`.
         task: "classification" of images, or "segmentation" or "distance" for every pixel.
         colors: the color (r, g, b) of each class, in 0 … 255, if the data have colors.

@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from frames import WOODSCAPE, blob, centroid
+from frames import WOODSCAPE, at_size, blob, centroid
 from hypothesis import given
 
 from darswin.data import IGNORE, FullSize, fitted
@@ -13,11 +13,6 @@ from darswin.lens import Equidistant, KannalaBrandt, load
 from darswin.lens.orientation import upright
 from darswin.lens.pixels import pixel_angles
 from darswin.utils.resize import area_resized
-
-
-def at_size(image, lens, size, fit):
-    remap = fitted(image.shape[:2], size, fit).at(lens, image.shape[:2])
-    return remap(image), remap.camera
 
 
 def full_size(lens, size, fit):
