@@ -106,11 +106,11 @@ class Lens(LensInImage):
             # A θ_max beyond this dtype's limit is reduced; one beyond the model's is an error.
             exact = self.detach().to(torch.float64).theta_limit
             beyond &= ~(wanted <= exact * slack)
-        if bool(beyond.any()):
-            last = times * exact.detach()[beyond][0].item()
-            end = f"where r of this {type(self).__name__} lens stops rising"
-            range_ = f"at most {last:.6f} rad ({math.degrees(last):.2f}°), {end}"
-            self._require(given, ~beyond, range_, times * wanted)
+            if bool(beyond.any()):
+                last = times * exact.detach()[beyond][0].item()
+                end = f"where r of this {type(self).__name__} lens stops rising"
+                range_ = f"at most {last:.6f} rad ({math.degrees(last):.2f}°), {end}"
+                self._require(given, ~beyond, range_, times * wanted)
         self.theta_max = torch.where(wanted > limit, limit, wanted)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:

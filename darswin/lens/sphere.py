@@ -162,7 +162,7 @@ def sphere_angle(rho: Tensor, xi: Tensor) -> Tensor:
 def sphere_limit(xi: Tensor) -> Tensor:
     """The θ up to which sin θ / (ξ + cos θ) rises."""
     with torch.no_grad():
-        return torch.acos(-torch.where(xi <= 1, xi, 1 / xi.clamp(min=1))) - MARGIN
+        return torch.acos(-torch.minimum(xi, xi.reciprocal())) - MARGIN
 
 
 def _cone(alpha: Tensor) -> Tensor:

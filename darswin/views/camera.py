@@ -119,25 +119,35 @@ class CameraView(PixelView):
         outside for NaN: by tables along the radius, because a picture has many more radii."""
         last, ratios, angles = self._curves(lens)
         u, v = flat_points(self.lens, self.size, y, x, self.turn.matrix.T)
-        radius = np.sqrt(u * u + v * v)
+        radius = u * u
+        radius += v * v
+        np.sqrt(radius, out=radius)
         share = radius * ((_RADII - 1) / last)
         whole = np.floor(share)
         share -= whole
         index = whole.astype(np.intp)
 
         def at(table: np.ndarray) -> np.ndarray:
-            return table[0].take(index, mode="clip") + table[1].take(index, mode="clip") * share
+            found = table[1].take(index, mode="clip")
+            found *= share
+            found += table[0].take(index, mode="clip")
+            return found
 
-        ratio, offset = at(ratios), np.zeros((2, 1, 1), np.float32)
+        ratio = at(ratios)
         if angles is not None:
             ray = np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None]
             rays = torch.from_numpy(at(angles))[None], torch.from_numpy(ray)[None]
             offset = np.moveaxis(lens.to(torch.float32).offset(*rays)[0].numpy(), -1, 0)
-        u, v = u * ratio + offset[0], v * ratio + offset[1]
+        u *= ratio
+        v *= ratio
+        if angles is not None:
+            u, v = u + offset[0], v + offset[1]
         if lens.affine is not None:
             u, v = (a * u + b * v for a, b in lens.affine[0].tolist())
-        cx, cy = lens.center_in(size)[0].tolist()
-        return np.stack((u + np.float32(cx), v + np.float32(cy)), -1)
+        points = np.empty((2, *u.shape), np.float32)
+        for row, flat, center in zip(points, (u, v), lens.center_in(size)[0].tolist(), strict=True):
+            np.add(flat, center, out=row)
+        return np.moveaxis(points, 0, -1)
 
     def _curves(self, own: Lens) -> tuple[float, np.ndarray, np.ndarray | None]:
         """The radius of the last ray that both lenses see in the new picture; and at equally spaced

@@ -199,7 +199,7 @@ class Remap:
             from darswin.frames.compiled import frames
 
             supersampling = self.points.shape[1] // self.view_size[1]
-            seen = frames.read(planes, self.points, supersampling)
+            seen = frames.read(planes, *np.moveaxis(self.points, -1, 0), supersampling)
         else:
             images = as_tensor(planes).movedim(2, 0)[None]
             images = images if images.is_floating_point() else images.float()
