@@ -370,7 +370,8 @@ def test_a_picture_is_read_at_any_points(data):
 def test_what_cannot_be_read_is_refused():
     picture, x = np.zeros((3, 4, 1), np.uint8), np.zeros((2, 4), np.float32)
     for wrong in ((picture[0], x, x, 1), (picture, x[0], x[0], 1), (picture, x, x, 3),
-                  (picture, x, x, 0), (picture, x, x[:1], 1), (picture, x, x[:, :2], 1)):  # fmt: skip
+                  (picture, x, x, 0), (picture, x, x[:1], 1),
+                  (picture, x, x[:, :2], 1)):  # fmt: skip
         with pytest.raises(ValueError, match="expected a picture"):
             compiled.read(*wrong)
     with pytest.raises(TypeError):
