@@ -116,6 +116,8 @@ class CropView(PixelView):
 
         if self.turn.angle and not self.each_pixel:
             return remap.sampled(picture)
+        if picture.dtype == np.float16:  # OpenCV has none
+            return self.picture(picture.astype(np.float32), remap).astype(picture.dtype)
         top, left, height, width = self.part
         if self.turn.angle:
             whole = CropView(self.part, (height, width), self.turn)

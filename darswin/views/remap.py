@@ -158,6 +158,8 @@ class Remap:
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):
             raise ValueError(f"points must have shape (..., 2), got {shape}")
+        if self.view.count > 1:
+            raise ValueError("points and boxes belong to one tile: use a map of `tiles`")
         if not isinstance(points, Tensor):
             given = np.asarray(points)
             moved = move(as_tensor(given, torch.float64)[None])[0]
@@ -186,6 +188,8 @@ class Remap:
             return self.view.see(picture, self._prepared)
         picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
         self._check_size(picture)
+        if not picture.size:  # no channels, which neither OpenCV nor torch takes
+            return self(np.zeros((*self.size, 1), picture.dtype))[..., :0]
         return self.view.picture(picture, self)
 
     def _check_size(self, picture: np.ndarray) -> None:
@@ -264,16 +268,21 @@ class Remap:
             target: (H, W), of the picture.
 
         Returns:
-            (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where
-            the view shows nothing.
+            (H', W'), n tiles as (n, H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and
+            0 in others, where the view shows nothing.
         """
         self._check_size(target)
+        if target.ndim != 2:
+            raise ValueError(f"a target must have shape (H, W), got {target.shape}")
+        if self.view.count > 1:
+            return np.stack([tile.target(target) for tile in self.tiles])
         x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
         height, width = self.size
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         target = np.asarray(target, target.dtype.newbyteorder("="))
         index = np.where(inside, y * width + x, 0).astype(np.intp)
-        return np.where(inside, target.ravel()[index], IGNORE if target.dtype == np.uint8 else 0)
+        missing = target.dtype.type(IGNORE if target.dtype == np.uint8 else 0)
+        return np.where(inside, target.ravel()[index], missing)
 
     @cached_property
     def _target_points(self) -> np.ndarray:
@@ -292,7 +301,7 @@ class Remap:
         """
         if isinstance(maps, Tensor):
             return self.view.back(maps, self._prepared)
-        planes = torch.from_numpy(maps.reshape(-1, *maps.shape[-3:]))
+        planes = as_tensor(maps.reshape(self.view.count, *maps.shape[-3:]))
         return self.view.back(planes, self._prepared)[0].numpy()
 
     @property

@@ -206,6 +206,38 @@ def test_one_box_has_one_answer(name, kind):
     assert thing.visible == pytest.approx(visible[0], abs=1e-3)
 
 
+@pytest.mark.parametrize("name", [*VIEWS, "none"])
+def test_arrays_of_any_type_order_and_number_of_channels(name):
+    remap = view_of(name).at(LENSES["oblong"], SIZE)
+    count = (remap.view.count,) if remap.view.count > 1 else ()
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 200, (*SIZE, 9)).astype(np.float64)
+    expected = remap(picture[..., :1])[..., 0]
+    for dtype in ("u1", "u2", "f2", "f4", "f8", ">u2", ">f4", ">f8"):
+        for channels in (0, 1, 2, 5, 9):
+            given = picture[..., :channels].astype(dtype)[::-1, ::-1].copy()[::-1, ::-1]
+            found = remap(given)
+            assert found.dtype == given.dtype.newbyteorder("=")
+            assert found.shape == (*count, *remap.view_size, channels)
+            if channels:
+                atol = 0.02 if dtype[-1] in "48" else 1.01
+                np.testing.assert_allclose(found[..., 0], expected, rtol=0, atol=atol)
+    maps = rng.integers(0, 9, (*count, 3, *remap.view_size))
+    for dtype in ("u1", "i8", "f2", "f4", ">u2", ">f4", "?"):
+        given = maps.astype(dtype)
+        back = remap.back(given[..., ::-1].copy()[..., ::-1])
+        assert back.dtype == given.dtype.newbyteorder("=") and back.shape == (3, *SIZE)
+        tensors = torch.from_numpy(given.astype(back.dtype).reshape(-1, 3, *remap.view_size))
+        np.testing.assert_array_equal(back, remap.back(tensors)[0])
+        assert remap.back(given[..., :0, :, :]).shape == (0, *SIZE)
+        labels = picture[..., 0].astype(dtype)
+        found = remap.target(labels)
+        assert found.dtype == labels.dtype.newbyteorder("=")
+        tiles = [tile.target(labels.astype(found.dtype)) for tile in remap.tiles]
+        np.testing.assert_array_equal(found, np.reshape(tiles, found.shape))
+        assert found.shape == (*count, *remap.view_size)
+
+
 @pytest.mark.parametrize("name", sorted(set(list_views()) - {"polar", "none"}))
 @given(st.data())
 def test_any_sizes_from_one_pixel_up(name, data):
@@ -243,6 +275,10 @@ def test_a_remap_is_of_one_lens_and_one_size():
     remap = view.at(LENSES["cut"], SIZE)
     with pytest.raises(ValueError, match=r"the picture must be \(H, W\) = \(90, 120\)"):
         remap(np.zeros((9, 9), np.uint8))
+    with pytest.raises(ValueError, match=r"target must have shape \(H, W\), got \(90, 120, 3\)"):
+        remap.target(np.zeros((*SIZE, 3), np.uint8))
+    with pytest.raises(ValueError, match="belong to one tile"):
+        make_view("tiles", (8, 8)).at(LENSES["cut"], SIZE).boxes_to_view(np.ones((1, 4)))
     with pytest.raises(TypeError, match="rays need the lens"):
         make_view("none", None).at(None, SIZE).rays(np.zeros((1, 2)))
     with pytest.raises(ValueError, match="mean and the std"):
