@@ -150,12 +150,16 @@ class CameraView(PixelView):
         return np.moveaxis(points, 0, -1)
 
     def _curves(self, own: Lens) -> tuple[float, np.ndarray, np.ndarray | None]:
-        """The radius of the last ray that both lenses see in the new picture; and at equally spaced
-        radii up to it, the radius in the old picture as a multiple, and θ if the old lens is not
-        radial: values and the steps between them, (2, K). Radii beyond lead outside."""
+        """The radius of the last ray in the new picture, up to its corners, that both lenses see;
+        and at equally spaced radii up to it, the radius in the old picture as a multiple, and θ if
+        the old lens is not radial: values and the steps between them, (2, K). Radii beyond lead
+        outside."""
         new_lens = self._like(own)
-        theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None]
-        theta = theta * torch.minimum(own.theta_max, new_lens.theta_max)
+        sides = (np.array((-0.5, side - 0.5)) for side in self.size)
+        corners = np.hypot(*flat_points(self.lens, self.size, *sides, STILL.matrix))
+        in_corner = new_lens.unproject(corners.max().item())  # NaN beyond θ_max
+        last = torch.fmin(torch.minimum(own.theta_max, new_lens.theta_max), in_corner)
+        theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None] * last
         new, old = (lens.project(theta)[0].detach().numpy() for lens in (new_lens, own))
         radii = np.linspace(0, new[-1], _RADII)
         ratios = np.interp(radii, new, old)

@@ -63,11 +63,11 @@ class CropView(PixelView):
 
     def to_image(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         turns, moves = self._affine(lens, size, points)
-        return (points - moves) @ torch.linalg.inv(turns).mT
+        return torch.einsum("nij,n...j->n...i", torch.linalg.inv(turns), points - moves)
 
     def to_view(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         turns, moves = self._affine(lens, size, points)
-        return points @ turns.mT + moves
+        return torch.einsum("nij,n...j->n...i", turns, points) + moves
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         theta, direction = pixel_rays(self.camera(lens, size), self.size)
@@ -99,13 +99,12 @@ class CropView(PixelView):
         return zoom * moves + (zoom - 1) / 2 * [[0, 0, 1]]
 
     def _affine(self, lens: Lens, size: Pair, like: Tensor) -> tuple[Tensor, Tensor]:
-        """`_matrix` of N lenses for points (N, ..., 2): (N, …, 2, 2), and (N, …, 1, 2)."""
+        """`_matrix` of N lenses for points (N, ..., 2): (N, 2, 2), and (N, …, 2)."""
         # Without a rotation, it is the same for all lenses, and the graph may not know how many.
         each = [lens[k] for k in range(len(lens))] if self.turn.angle else [lens]
         matrix = torch.from_numpy(np.stack([self._matrix(one, size) for one in each]))
-        shape = (len(each), *(1,) * max(like.dim() - 3, 0), 2, 3)
-        matrix = matrix.to(like.device, like.dtype).reshape(shape)
-        return matrix[..., :2], matrix[..., 2][..., None, :]
+        matrix = matrix.to(like.device, like.dtype)
+        return matrix[..., :2], matrix[..., 2].reshape(len(each), *(1,) * (like.dim() - 2), 2)
 
     # -- of one lens ----------------------------------------------------------------------------
 

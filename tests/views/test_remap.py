@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from darswin import boxes as of_boxes
 from darswin.data.labels.labels import Thing, move_things
 from darswin.frames import Sampler
-from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Spherical
+from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Perspective, Spherical
 from darswin.models import LensAdapter
 from darswin.views import CameraView, CropView, Turn, list_views, make_view
 
 SIZE = (90, 120)
 LENSES = {
-    "circle": Equidistant(36.0, 1.2, center=[57.0, 46.0], image_size=SIZE),
+    "circle": Equidistant(23.0, 1.9, center=[57.0, 46.0], image_size=SIZE),
     "cut": KannalaBrandt(60.0, [0.01, -0.004], 1.5, center=[61.0, 43.0], image_size=SIZE),
     "oblong": Spherical(0.7, 60.0, 1.4, [58.0, 45.0], affine=[[1, 0.04], [0, 0.85]],
                         image_size=SIZE),
@@ -36,6 +36,7 @@ def view_of(name, size=(40, 40), **options):
     own = {
         "camera": lambda: CameraView(OTHER, turn=Turn(0.4, True), **options),
         "camera of another kind": lambda: CameraView(SHEARED, **options),
+        "camera up to 90°": lambda: CameraView(Perspective(25.0, image_size=(50, 60)), **options),
         "crop": lambda: CropView((10, 20, 71, 83), (34, 45)),
         "turned crop": lambda: CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
         "none": lambda: make_view("none", SIZE),
@@ -46,7 +47,7 @@ def view_of(name, size=(40, 40), **options):
 
 
 VIEWS = [*sorted(set(list_views()) - {"polar"}), "camera", "camera of another kind", "crop",
-         "turned crop"]  # fmt: skip
+         "camera up to 90°", "turned crop"]  # fmt: skip
 pairs = pytest.mark.parametrize(("name", "kind"), product(VIEWS, LENSES))
 
 
@@ -95,6 +96,9 @@ def test_points_and_their_inverse(name, kind):
         assert known.mean() > 0.98 or not inside.any()
         as_tensors = remap.to_image(torch.from_numpy(pixels))
         np.testing.assert_array_equal(as_tensors.numpy(), found)
+        for move in (remap.to_image, remap.to_view, remap.rays):
+            one, all_of_them = move(pixels[20, 15]), move(pixels)
+            np.testing.assert_allclose(one, all_of_them[20, 15], rtol=0, atol=1e-9)
 
 
 @pairs
