@@ -85,7 +85,8 @@ class CameraView(PixelView):
             return self.supersampling
         if not readable(lens.theta_max):
             raise ValueError("a graph does not know its lens: give a supersampling to CameraView")
-        return points_along((lens.r_max / self.lens.r_max.to(lens.theta_max)).max().item())
+        scales = lens.r_max / self.lens.r_max.to(lens.theta_max)
+        return points_along(max(scales.tolist(), default=0.0))
 
     def _seen(self, own: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
         """θ, NaN where no ray lands, and (cos φ, sin φ) in the frame of the images."""

@@ -102,8 +102,8 @@ class CropView(PixelView):
         """`_matrix` of N lenses for points (N, ..., 2): (N, 2, 2), and (N, …, 2)."""
         # Without a rotation, it is the same for all lenses, and the graph may not know how many.
         each = [lens[k] for k in range(len(lens))] if self.turn.angle else [lens]
-        matrix = torch.from_numpy(np.stack([self._matrix(one, size) for one in each]))
-        matrix = matrix.to(like.device, like.dtype)
+        found = np.array([self._matrix(one, size) for one in each]).reshape(-1, 2, 3)
+        matrix = torch.from_numpy(found).to(like.device, like.dtype)
         return matrix[..., :2], matrix[..., 2].reshape(len(each), *(1,) * (like.dim() - 2), 2)
 
     # -- of one lens ----------------------------------------------------------------------------

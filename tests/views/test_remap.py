@@ -266,6 +266,17 @@ def test_any_sizes_from_one_pixel_up(name, data):
     assert remap.back(np.ones((view_count(remap), 2, *shape), np.float32)).shape == (2, *size)
 
 
+@pytest.mark.parametrize("name", VIEWS)
+def test_no_pictures_of_no_lenses(name):
+    view, lens = view_of(name), LENSES["oblong"]
+    for lenses in (lens, lens[:0]):
+        assert view(torch.zeros(0, 3, *SIZE), lenses).shape == (
+            0,
+            3,
+            *view.at(lens, SIZE).view_size,
+        )
+
+
 def view_count(remap):
     return len(remap.tiles)
 
