@@ -39,9 +39,8 @@ def ray_channels(theta: Tensor, direction: Tensor) -> Tensor:
     Returns:
         The unit vectors (x, y, z), (N, 3, H, W); 0 where θ is NaN.
     """
-    seen = ~theta.isnan()
-    rays = vector_of(torch.where(seen, theta, 0.0), direction)  # NaN must not reach the gradients
-    return torch.where(seen[..., None], rays, 0.0).permute(0, 3, 1, 2)
+    rays = torch.where(theta.isnan()[..., None], 0.0, vector_of(theta, direction))
+    return rays.permute(0, 3, 1, 2)
 
 
 def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:

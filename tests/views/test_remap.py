@@ -99,6 +99,11 @@ def test_points_and_their_inverse(name, kind):
         for move in (remap.to_image, remap.to_view, remap.rays):
             one, all_of_them = move(pixels[20, 15]), move(pixels)
             np.testing.assert_allclose(one, all_of_them[20, 15], rtol=0, atol=1e-9)
+            ends = torch.tensor([[12.0, 11], [500, 500]], requires_grad=True)
+            moved = move(ends)
+            torch.nan_to_num(moved).sum().backward()
+            assert ends.grad.isfinite().all()
+            assert (ends.grad.any(-1) != moved.isnan().any(-1)).all()
 
 
 @pairs
