@@ -156,8 +156,8 @@ class CameraView(PixelView):
         the old lens is not radial: values and the steps between them, (2, K). Radii beyond lead
         outside."""
         new_lens = self._like(own)
-        sides = (np.array((-0.5, side - 0.5)) for side in self.size)
-        corners = np.hypot(*flat_points(self.lens, self.size, *sides, STILL.matrix))
+        y, x = (np.array((-0.5, side - 0.5)) for side in self.size)
+        corners = np.hypot(*flat_points(self.lens, self.size, y, x, STILL.matrix))
         in_corner = new_lens.unproject(corners.max().item())  # NaN beyond θ_max
         last = torch.fmin(torch.minimum(own.theta_max, new_lens.theta_max), in_corner)
         theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None] * last
