@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from darswin.deploy.networks import frame_program
 from darswin.deploy.optimize import check_model, optimized
 from darswin.deploy.program import NoProgramError
-from darswin.deploy.programs import frame_program
 from darswin.frames.plans import Output, Plan, check_name, check_output, check_size, write_arrays
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
-from darswin.deploy.packed import Libraries, fastest_dtype
+from darswin.deploy.networks import Programs
+from darswin.deploy.packed import Libraries, OneDNN, fastest_dtype
 from darswin.deploy.program import NoProgramError, Weights
-from darswin.deploy.programs import Programs
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
@@ -76,7 +76,7 @@ def optimize(
 
 
 def optimized(
-    model: Net, dtype: torch.dtype | str = torch.float32, lens: Lens | None = None,
+    model: Net, dtype: torch.dtype | Literal["fastest"] = torch.float32, lens: Lens | None = None,
     batches: Iterable[Sequence] | None = None, *, strict: bool = False, own_alone: bool = False,
 ) -> Net:  # fmt: skip
     """`optimize`; own_alone: by our own operators, where oneDNN is faster too."""
@@ -90,9 +90,10 @@ def optimized(
     elif batches is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
-        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
+        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=3)
     libraries = Libraries(dtype, own_alone=own_alone)
-    made = copy.deepcopy(model).eval().requires_grad_(False).float()
+    by_onednn = isinstance(libraries.of(model), OneDNN)
+    made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
     fast(made, libraries)
     for part in made.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
@@ -100,16 +101,15 @@ def optimized(
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
     vars(made).update(weights=libraries.weights)
-    if dtype == torch.float32:
-        try:
-            vars(made).update(programs=Programs(made, made.layers, libraries.weights))
-        except NoProgramError as error:
-            if strict:
-                raise
-            vars(made).update(lack=f"layer by layer, because of {error}")
-    elif strict:
-        raise NoProgramError(f"models of {dtype} are no programs")
-    return made
+    try:
+        if by_onednn:
+            raise NoProgramError("the library oneDNN, which computes its products faster here")
+        vars(made).update(programs=Programs(made, made.layers, libraries.weights))
+    except NoProgramError as error:
+        if strict:
+            raise
+        vars(made).update(lack=f"layer by layer, because of {error}")
+    return made  # type: ignore[no-any-return]
 
 
 def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:

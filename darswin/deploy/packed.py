@@ -80,11 +80,11 @@ class OwnBlocks(PackedBlocks):
 class Own:
     """Our own operators, in float32 and, if `has_own_int8`, of quantized layers.
 
-    Args: weights: of the programs of the model.
+    Args: weights: of the programs of a model; None for layers alone.
     """
 
-    def __init__(self, weights: Weights):
-        self.weights = weights
+    def __init__(self, weights: Weights | None = None):
+        self.weights = Weights() if weights is None else weights
 
     def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
         """A linear layer, behind a norm or before a GELU if asked."""
@@ -109,7 +109,7 @@ class OneDNN(Own):
     product, torch computes those in bfloat16, and our own operators those of quantized layers.
     """
 
-    def __init__(self, dtype: torch.dtype, weights: Weights):
+    def __init__(self, dtype: torch.dtype, weights: Weights | None = None):
         super().__init__(weights)
         self.dtype = dtype
 

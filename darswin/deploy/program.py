@@ -277,9 +277,7 @@ class Program:
         """A map at points (H', W', 2) between its pixels, 0 outside."""
         (height, width, channels), size = x.shape, points.shape[:2]
         out = self.buffer(*size, channels)
-        return self._step(
-            SAMPLE, out, [x, points], x, out, height, width, *size, channels, points
-        )
+        return self._step(SAMPLE, out, [x, points], x, out, height, width, *size, channels, points)
 
     def to_image(self, x: Slot, plan: Slot) -> Slot:
         """A polar map at the pixels of the images, by a plan (H, 3, W)."""

@@ -11,19 +11,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.overrides import resolve_name
 
-from darswin.deploy.own import OwnLinear, OwnNorm
-from darswin.deploy.packed import OwnBlocks
 from darswin.deploy.program import NoProgramError, Program, Slot, Weights
-from darswin.lens.pixels import OUTSIDE, sample_at
-from darswin.models.pixel import distances
 from darswin.models.prepared import Prepared
-from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
 
-RULES: dict[Any, Callable[..., Any]] = {}
+RULES: dict[Any, Callable[..., Any]] = {}  # lowering.py has them
 _RESHAPES = (Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten, Tensor.contiguous)
 
 
@@ -46,7 +40,7 @@ class Recorded(Tensor):
         source: the value, of another shape, of which the copy is made.
     """
 
-    trace: "Trace"
+    writer: "Trace"
     meta: Tensor
     slot: Slot | None
     source: "Recorded"
@@ -57,6 +51,8 @@ class Recorded(Tensor):
         if function in RULES:
             return RULES[function](*arguments, **named)
         values = [value for value in arguments if isinstance(value, Recorded)]
+        if any(isinstance(v, Tensor) and not isinstance(v, Recorded) for v in arguments):
+            raise NoProgramError(f"{resolve_name(function)} is no instruction")
         with torch._C.DisableTorchFunctionSubclass():
             plain = (v.meta if isinstance(v, Recorded) else v for v in arguments)
             result = function(*plain, **named)
@@ -67,18 +63,18 @@ class Recorded(Tensor):
             raise NoProgramError(f"{resolve_name(function)} is no instruction")
         (value,) = values
         if function in _RESHAPES and not _shares(result, value.meta):
-            return value.trace.copy_of(value, result)
+            return value.writer.copy_of(value, result)
         if value.slot is None:
             return function(value.made(), *arguments[1:], **named)
         if not all(_shares(one, value.meta) for one in results):
             raise NoProgramError(f"{resolve_name(function)} is no instruction")
-        found = [value.trace.value(value.slot, one) for one in results]
+        found = [value.writer.view(value, one) for one in results]
         return found[0] if isinstance(result, Tensor) else found
 
     def made(self) -> "Recorded":
         """The value with a slot."""
         if self.slot is None:
-            self.slot = self.trace.dense(self.source)
+            self.slot = self.writer.dense(self.source)
         return self
 
     def order(self) -> list[int]:
@@ -118,8 +114,12 @@ class Trace:
     def value(self, slot: Slot | None, meta: Tensor) -> Recorded:
         """A view of a slot."""
         value = meta.as_subclass(Recorded)
-        value.trace, value.meta, value.slot = self, meta, slot
+        value.writer, value.meta, value.slot = self, meta, slot
         return value
+
+    def view(self, value: Recorded, meta: Tensor) -> Recorded:
+        """Another view of the numbers of a value."""
+        return self.value(value.slot, meta)
 
     def filled(self, slot: Slot, order: Sequence[int] | None = None) -> Recorded:
         """A whole slot in its shape; `order`: the axes of the slot's, in the order of the value."""
@@ -173,7 +173,13 @@ class Trace:
         sizes, reads, writes = zip(*(merged or [(1, 1, 1)]), strict=True)
         assert target.slot is not None
         self.program.copy(
-            x, target.slot, sizes, reads, writes, to.storage_offset(), meta.storage_offset()
+            x,
+            target.slot,
+            sizes,
+            reads,
+            writes,
+            int(to.storage_offset()),
+            int(meta.storage_offset()),
         )
 
     def by_rows(self, x: Recorded, width: int, write: Callable[[Slot], Slot]) -> Recorded:
@@ -200,6 +206,11 @@ class Trace:
             slot = self.dense(value, order)
             self.program.output(slot)
             self.results.append(Output(slot, order))
+
+
+def inverse(order: Sequence[int]) -> list[int]:
+    """The order that undoes an order of axes."""
+    return sorted(range(len(order)), key=order.__getitem__)
 
 
 def _is_whole(meta: Tensor, slot: Slot) -> bool:
@@ -253,167 +264,3 @@ def _module_of(error: Exception, network: nn.Module) -> str:
         if name := names.get(id(module)):
             found = f"{name} ({type(module).__name__})"
     return found
-
-
-# -- layers of our own ---------------------------------------------------------------------------
-
-
-@lowers(OwnLinear.__call__)
-def _(layer: OwnLinear, x: Recorded) -> Recorded:
-    return x.trace.by_rows(x, layer.columns, lambda rows: x.trace.program.linear(rows, layer))
-
-
-@lowers(OwnNorm.__call__)
-def _(norm: OwnNorm, x: Recorded) -> Recorded:
-    return x.trace.by_rows(x, x.shape[-1], lambda rows: x.trace.program.norm(rows, norm))
-
-
-@lowers(OwnBlocks.__call__)
-def _(blocks: OwnBlocks, x: Recorded, tables: Sequence[Tensor]) -> Recorded:
-    trace, inputs = x.trace, [x.trace.of(table).slot for table in tables]
-    return trace.filled(trace.program.blocks(trace.dense(x), blocks, inputs))  # type: ignore[arg-type]
-
-
-# -- functions between them ----------------------------------------------------------------------
-
-
-@lowers(Tensor.device.__get__)
-def _(x: Recorded) -> torch.device:
-    return torch.device("cpu")  # where tensors of the lens are
-
-
-@lowers(Tensor.to, Tensor.float)
-def _(x: Tensor, *_: Any, **__: Any) -> Tensor:
-    return x if isinstance(x, Recorded) else x.float()
-
-
-@lowers(Tensor.contiguous)
-def _(x: Recorded, memory_format: torch.memory_format = torch.contiguous_format) -> Recorded:
-    if memory_format != torch.contiguous_format or x.meta.is_contiguous():
-        return x
-    return x.trace.copy_of(x, x.meta)
-
-
-@lowers(Tensor.mean)
-def _(x: Recorded, dim: Sequence[int]) -> Recorded:
-    if tuple(dim) != tuple(range(1, x.dim() - 1)):
-        raise NoProgramError(f"a mean over the axes {tuple(dim)} is no instruction")
-    return x.trace.filled(x.trace.program.mean(x.trace.dense(x)))
-
-
-@lowers(torch.add, Tensor.add, Tensor.__add__, Tensor.__radd__)
-def _(x: Tensor, y: Tensor) -> Recorded:
-    trace = next(value.trace for value in (x, y) if isinstance(value, Recorded))
-    if not (isinstance(x, Tensor) and isinstance(y, Tensor) and x.shape == y.shape):
-        raise NoProgramError("a sum of values of other shapes is no instruction")
-    one, other = trace.of(x), trace.of(y)
-    order = one.made().order()
-    total = trace.program.added(trace.dense(one, order), trace.dense(other, order))
-    return trace.filled(total, inverse(order))
-
-
-@lowers(F.gelu)
-def _(x: Recorded) -> Recorded:
-    order = x.made().order()
-    return x.trace.filled(x.trace.program.gelu(x.trace.dense(x, order)), inverse(order))
-
-
-@lowers(distances)
-def _(x: Recorded, typical: float) -> Recorded:
-    order = x.made().order()
-    found = x.trace.program.distance(x.trace.dense(x, order), typical)
-    return x.trace.filled(found, inverse(order))
-
-
-@lowers(torch.cat)
-def _(tensors: Sequence[Tensor], dim: int = 0) -> Recorded:
-    trace = next(value.trace for value in tensors if isinstance(value, Recorded))
-    parts = [trace.of(value) for value in tensors]
-    first, dim = parts[0], dim % parts[0].dim()
-    # Convolutions read maps with the channels last.
-    order = [0, 2, 3, 1] if first.dim() == 4 and dim == 1 else first.made().order()
-    sizes = list(first.shape)
-    sizes[dim] = sum(part.shape[dim] for part in parts)
-    whole = trace.filled(
-        trace.program.buffer(*(sizes[axis] for axis in order[1:])), inverse(order)
-    )
-    begin = 0
-    for part in parts:
-        place = whole.narrow(dim, begin, part.shape[dim])
-        begin += part.shape[dim]
-        if part.slot is None and (there := _viewed(place, part.source.shape)) is not None:
-            part, place = part.source, there
-        part.made()
-        assert part.slot is not None
-        trace.move(part.slot, part.meta, place)
-    return whole
-
-
-def _viewed(place: Recorded, shape: Sequence[int]) -> Recorded | None:
-    """A view in another shape, or None if its strides have none."""
-    try:
-        meta = place.meta.view(shape)
-    except RuntimeError:
-        return None
-    return place.trace.value(place.slot, meta)
-
-
-@lowers(torch.where)
-def _(condition: Tensor, x: Recorded, other: float) -> Recorded:
-    """Pixels (1, K, H, W) where the condition (1, 1, H, W) is true, else 0."""
-    if isinstance(condition, Recorded) or other != 0.0:
-        raise NoProgramError("a choice between values is no instruction")
-    if condition.all():
-        return x
-    rows, columns = (torch.arange(side) for side in condition.shape[2:])
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
-    return sample_at(x, torch.where(condition[:, 0, :, :, None], pixels, OUTSIDE))  # type: ignore[return-value]
-
-
-# -- maps and pixels -----------------------------------------------------------------------------
-
-_LAST, _FIRST = (0, 2, 3, 1), (0, 3, 1, 2)  # (1, C, H, W) as (1, H, W, C), and back
-
-
-@lowers(torch.conv2d)
-def _(x, weight, bias, stride, padding, dilation, groups) -> Recorded:
-    kind = (tuple(weight.shape[2:]), *map(tuple, (stride, padding, dilation)), groups)
-    if kind != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
-        size, *_ = kind
-        raise NoProgramError(f"this convolution of {size[0]} × {size[1]} is no instruction")
-    return x.trace.filled(x.trace.program.conv(x.trace.dense(x, _LAST), weight, bias), _FIRST)
-
-
-@lowers(F.interpolate)
-def _(x: Recorded, size: Any, mode: str, align_corners: bool | None, **others: Any) -> Recorded:
-    if mode != "bilinear" or align_corners or any(others.values()):
-        raise NoProgramError(f"this interpolation, {mode}, is no instruction")
-    return x.trace.filled(x.trace.program.resized(x.trace.dense(x, _LAST), tuple(size)), _FIRST)
-
-
-@lowers(sample_at)
-def _(images: Recorded, pixels: Tensor) -> Recorded:
-    trace = images.trace
-    points = trace.of(pixels.float()).slot
-    assert points is not None
-    return trace.filled(trace.program.sampled(trace.dense(images, _LAST), points), _FIRST)
-
-
-@lowers(polar_to_image)
-def _(x, radii, center, size, *, affine, points, r_max, plan, layout) -> Recorded:
-    if plan is None:
-        like = radii.new_empty((1, *x.shape[1:3], 0))
-        plan = polar_to_image_plan(
-            like, radii, center, size, affine=affine, points=points, r_max=r_max
-        )
-    if layout != "tokens" or plan is None:
-        raise NoProgramError("polar_to_image without a plan is no instruction")
-    trace = x.trace
-    there = trace.of(plan).slot
-    assert there is not None
-    return trace.filled(trace.program.to_image(trace.dense(x), there))
-
-
-def inverse(order: Sequence[int]) -> list[int]:
-    """The order that undoes an order of axes."""
-    return sorted(range(len(order)), key=order.__getitem__)

@@ -80,7 +80,9 @@ class DistanceHead(PixelHead):
     def finish(self, logits: Tensor, shown: Tensor | None = None) -> Tensor:
         """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64; 0 unless shown."""
         metres = distances(logits, self.typical_distance)
-        return metres if shown is None else torch.where(shown.to(metres.device)[:, None], metres, 0.0)
+        return (
+            metres if shown is None else torch.where(shown.to(metres.device)[:, None], metres, 0.0)
+        )
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, typical_distance={self.typical_distance}"

@@ -222,7 +222,8 @@ class Unet(PixelModel):
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         prepared = super().prepare(lens, size)
-        steps = zip(self.places, prepared.tokens, strict=True)
+        layers: list[Any] = list(self.places)
+        steps = zip(layers, prepared.tokens, strict=True)
         return prepared._replace(tokens=[layer(place.to(layer.weight)) for layer, place in steps])
 
 

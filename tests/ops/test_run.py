@@ -7,7 +7,7 @@ import torch
 from helpers import network
 
 from darswin import optimize
-from darswin.deploy.programs import frame_program
+from darswin.deploy.networks import frame_program
 from darswin.deploy.program import Program, Weights
 from darswin.lens import Spherical
 

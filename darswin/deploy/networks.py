@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+import darswin.deploy.lowering  # noqa: F401  (it registers the rules)
 from darswin.deploy.packed import refuse_gradients
 from darswin.deploy.program import RUN, NoProgramError, Weights
 from darswin.deploy.record import Trace, inverse, traced
@@ -111,9 +112,7 @@ class Programs:
 
     def _trace(self, prepared: Prepared, shapes: Any) -> Trace:
         seen, *images = shapes
-        return traced(
-            self._model, self._forward, self._weights, seen, prepared, *images or [None]
-        )
+        return traced(self._model, self._forward, self._weights, seen, prepared, *images or [None])
 
 
 class FrameProgram(NamedTuple):
