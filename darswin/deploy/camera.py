@@ -115,7 +115,7 @@ def export_network(
     try:
         with torch.no_grad():
             dtype = torch.int8 if quantized_layers(model) else torch.float32
-            fast = optimized(model, dtype, strict=True, own_alone=True)
+            fast = optimized(model, dtype, own_alone=True)
             program = frame_program(fast, lens, size)
     except NoProgramError as error:
         raise TypeError(

@@ -55,9 +55,9 @@ def _(x: Recorded, memory_format: torch.memory_format = torch.contiguous_format)
 
 
 @lowers(Tensor.mean)
-def _(x: Recorded, dim: Sequence[int]) -> Recorded:
-    if tuple(dim) != tuple(range(1, x.dim() - 1)):
-        raise NoProgramError(f"a mean over the axes {tuple(dim)} is no instruction")
+def _(x: Recorded, dim: int | Sequence[int]) -> Recorded:
+    if dim != (*range(1, x.dim() - 1),):
+        raise NoProgramError(f"a mean over the axes {dim} is no instruction")
     return x.writer.filled(x.writer.program.mean(x.writer.dense(x)))
 
 
@@ -134,10 +134,9 @@ _LAST, _FIRST = (0, 2, 3, 1), (0, 3, 1, 2)  # (1, C, H, W) as (1, H, W, C), and 
 
 
 @lowers(torch.conv2d)
-def _(x, weight, bias, stride, padding, dilation, groups) -> Recorded:
-    kind = (tuple(weight.shape[2:]), *map(tuple, (stride, padding, dilation)), groups)
-    if kind != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
-        size, *_ = kind
+def _(x, weight, bias=None, stride=1, padding=0, dilation=1, groups=1) -> Recorded:
+    size = tuple(weight.shape[2:])
+    if (size, stride, padding, dilation, groups) != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
         raise NoProgramError(f"this convolution of {size[0]} × {size[1]} is no instruction")
     return x.writer.filled(x.writer.program.conv(x.writer.dense(x, _LAST), weight, bias), _FIRST)
 

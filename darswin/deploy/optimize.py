@@ -106,10 +106,11 @@ def optimized(
             raise NoProgramError("the library oneDNN, which computes its products faster here")
         vars(made).update(programs=Programs(made, made.layers, libraries.weights))
     except NoProgramError as error:
+        lack = f"layer by layer, because of {error}"
         if strict:
-            raise
-        vars(made).update(lack=f"layer by layer, because of {error}")
-    return made  # type: ignore[no-any-return]
+            raise TypeError(f"model must become one program, but it runs {lack}") from error
+        vars(made).update(lack=lack)
+    return made
 
 
 def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:

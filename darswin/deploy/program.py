@@ -18,8 +18,10 @@ NOTHING, AND_GELU = range(2)  # what follows a product
 COPY_AXES = 5
 
 
-class NoProgramError(TypeError):
+class NoProgramError(Exception):
     """The model has a part that is no instruction."""
+
+    # No TypeError: torch's `x + y` would take that for an operand that it does not support.
 
 
 class Slot(NamedTuple):
@@ -155,13 +157,14 @@ class Program:
         place: dict[tuple[bool, int], tuple[bool, int]] = {}
         made: dict[tuple[bool, int], Step] = {}
         for k, step in enumerate(self._steps):
-            base = step.base
-            if base is not None and step.opcode == ADD:  # to the summand that nobody reads later
-                first, second = step.reads
-                if not (base.is_buffer and last[base.key] == k):
-                    base, second = second, first
-                step = replace(step, base=base, arguments=(second, step.out))
-            if base is not None and base.is_buffer and last[base.key] == k:
+            base, free = step.base, step.base is not None and last[step.base.key] == k
+            if step.opcode == ADD:
+                base, other = step.reads
+                if not (base.is_buffer and free):  # then perhaps the other summand
+                    base, other = other, base
+                free = last[base.key] == k and base.key != other.key
+                step = replace(step, base=base, arguments=(other, step.out))
+            if base is not None and base.is_buffer and free:
                 place[step.out.key] = place.get(base.key, base.key)
                 before = made.get(base.key)
                 if step.opcode == GELU and before is not None and before.opcode == CONV:
