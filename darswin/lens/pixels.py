@@ -3,6 +3,7 @@
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.lens.base import Lens
 from darswin.lens.solve import determinant, length_of, vector_of
@@ -127,6 +128,8 @@ def as_map(pixels: Tensor) -> Tensor:
 def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     """Samples images (B, C, H, W) at pixels (B or 1, H', W', 2), bilinearly and with 0 outside:
     (B, C, H', W') on the images' device and in their dtype. Of integers it takes the nearest."""
+    if has_torch_function_unary(images):
+        return handle_torch_function(sample_at, (images,), images, pixels)
     height, width = images.shape[2:]
     mode = "bilinear" if images.is_floating_point() else "nearest"
     least = torch.float32 if mode == "bilinear" else torch.float64  # which holds large integers
