@@ -13,7 +13,7 @@ from darswin.lens.solve import vector_of
 from darswin.ops.checks import check_pair, readable
 from darswin.views.base import Pair, PerChannel
 from darswin.views.pixels import PixelView, check_supersampling
-from darswin.views.turn import STILL, Turn
+from darswin.views.turn import STILL, Turn, as_turn
 
 _MOST, _APART = 5, 1.5  # points along a pixel, and pixels of the picture between them
 _RADII = 4096  # entries of a table
@@ -36,6 +36,7 @@ class CameraView(PixelView):
         mean, std: the arguments of `View`.
 
     Raises:
+        TypeError: the lens is no `Lens`, or the turn no `Turn`.
         ValueError: the size is missing, or a number is out of range.
     """
 
@@ -51,10 +52,12 @@ class CameraView(PixelView):
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
+        if not isinstance(lens, Lens):
+            raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
         size = picture_size(lens) if size is None else check_pair("size", size, 1)
         super().__init__(size, mean=mean, std=std)
         check_supersampling(supersampling)
-        self.lens, self.turn, self.supersampling = lens, turn, supersampling
+        self.lens, self.turn, self.supersampling = lens, as_turn(turn), supersampling
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         return vector_of(*self._seen(self._like(lens), points))

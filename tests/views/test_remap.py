@@ -51,10 +51,12 @@ VIEWS = [*sorted(set(list_views()) - {"polar"}), "camera", "camera of another ki
 pairs = pytest.mark.parametrize(("name", "kind"), product(VIEWS, LENSES))
 
 
-def by_loops(remap, reads=1):
+def by_loops(remap, supersampling=1):
     """The points of the picture that the pixels of a view show, (k·H', k·W', 2), from rays."""
     height, width = remap.view_size
-    y, x = ((np.arange(side * reads) + 0.5) / reads - 0.5 for side in (height, width))
+    y, x = (
+        (np.arange(side * supersampling) + 0.5) / supersampling - 0.5 for side in (height, width)
+    )
     grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
     if isinstance(remap.view, CropView) or not remap.view.uses_lens:
         return remap.view.to_image(grid, remap.lens, remap.size)[0].numpy()
@@ -293,16 +295,62 @@ def test_a_remap_is_of_one_lens_and_one_size():
     with pytest.raises(TypeError, match=r"lens must be a darswin.lens.Lens, got NoneType"):
         view.at(None, SIZE)
     remap = view.at(LENSES["cut"], SIZE)
-    with pytest.raises(ValueError, match=r"the picture must be \(H, W\) = \(90, 120\)"):
-        remap(np.zeros((9, 9), np.uint8))
-    with pytest.raises(ValueError, match=r"target must have shape \(H, W\), got \(90, 120, 3\)"):
+    for picture, kind, message in (
+        (np.zeros((9, 9), np.uint8), ValueError, r"the picture must be \(H, W\) = \(90, 120\)"),
+        (torch.zeros(1, 3, 9, 9), ValueError, r"picture must be .*, got \(9, 9\)"),
+        (torch.zeros(3, *SIZE), ValueError, r"shape \(B, C, H, W\), .* pass images\[None\]"),
+        ([[1, 2]], TypeError, "the picture must be an array or a tensor, got list"),
+    ):
+        with pytest.raises(kind, match=message):
+            remap(picture)
+    with pytest.raises(ValueError, match=r"target must be .*, got \(90, 120, 3\)"):
         remap.target(np.zeros((*SIZE, 3), np.uint8))
+    for maps, form in (
+        (np.zeros((8, 8)), r"\(K, h, w\)"),
+        (torch.zeros(1, 8, 8), r"\(B, K, h, w\)"),
+    ):
+        with pytest.raises(ValueError, match=f"maps must have shape {form}, got"):
+            remap.back(maps)
     with pytest.raises(ValueError, match="belong to one tile"):
         make_view("tiles", (8, 8)).at(LENSES["cut"], SIZE).boxes_to_view(np.ones((1, 4)))
     with pytest.raises(TypeError, match="rays need the lens"):
         make_view("none", None).at(None, SIZE).rays(np.zeros((1, 2)))
     with pytest.raises(ValueError, match="mean and the std"):
         make_view("mercator", (8, 8), mean=None, std=None).at(LENSES["cut"], SIZE).plan("image")
+
+
+def test_frames_with_the_channels_last_are_seen_as_those_with_the_channels_first():
+    remap = make_view("mercator", (8, 8)).at(LENSES["cut"], SIZE)
+    frames = torch.randint(256, (2, *SIZE, 3), dtype=torch.uint8)
+    torch.testing.assert_close(remap(frames), remap(frames.permute(0, 3, 1, 2)))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_crop_beyond_the_picture_is_padded(mirrored):
+    picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
+    for part in ((-7, 20, 60, 50), (50, -11, 40, 140), (60, 100, 50, 50)):
+        crop = CropView(part, part[2:], Turn(mirrored=mirrored))
+        turned = picture[:, ::-1] if mirrored else picture
+        padded = np.pad(turned, ((50, 50), (50, 50), (0, 0)))
+        top, left, height, width = part[0] + 50, part[1] + 50, *part[2:]
+        wanted = padded[top : top + height, left : left + width]
+        np.testing.assert_array_equal(crop.at(LENSES["cut"], SIZE)(picture), wanted)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "message"),
+    [
+        (lambda: CropView((0, 0, 9), (5, 5)), TypeError, r"four ints, .*, got \(0, 0, 9\)"),
+        (lambda: CropView((0.5, 0, 9, 9), (5, 5)), TypeError, "four ints"),
+        (lambda: CropView((0, 0, -9, 9), (5, 5)), ValueError, "height and width of the part"),
+        (lambda: CropView((0, 0, 9, 9), (5, 5), 0.3), TypeError, "turn must be .*Turn, got 0.3"),
+        (lambda: CameraView(OTHER, turn=0.3), TypeError, "turn must be .*Turn, got 0.3"),
+        (lambda: CameraView("front.json"), TypeError, "lens must be a .*Lens, got str"),
+    ],
+)
+def test_wrong_parts_turns_and_lenses_are_refused(make, kind, message):
+    with pytest.raises(kind, match=message):
+        make()
 
 
 def test_a_plan_normalizes_as_the_view_says():
