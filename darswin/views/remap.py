@@ -102,14 +102,14 @@ class Remap:
     def to_view(self, points: Points) -> Points:
         """Pixels (..., 2) of the picture → pixels (..., 2) of the view, also beyond its edges; NaN
         where no ray lands. ValueError for points of another shape."""
-        return self._moved(points, lambda p: self._bound.to_view(p, self.lens, self.size))
+        return self._moved(points, lambda p: self._one.to_view(p, self.lens, self.size))
 
     def to_image(self, points: Points) -> Points:
         """Pixels (..., 2) of the view → pixels (..., 2) of the picture; NaN where it shows nothing:
         no ray lands, or it ends. ValueError for points of another shape."""
 
         def move(pixels: Tensor) -> Tensor:
-            found = self._bound.to_image(pixels, self.lens, self.size)
+            found = self._one.to_image(pixels, self.lens, self.size)
             sides = tensor_there(self.size[::-1], found)
             beyond = (found + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
             return torch.where(beyond.any(-1, keepdim=True), torch.nan, found)
@@ -119,7 +119,7 @@ class Remap:
     def rays(self, points: Points) -> Points:
         """Pixels (..., 2) of the view → unit vectors (..., 3) in the camera's frame, NaN where the
         view shows nothing."""
-        return self._moved(points, lambda p: self._bound.to_rays(p, self.some_lens, self.size))
+        return self._moved(points, lambda p: self._one.to_rays(p, self.some_lens, self.size))
 
     def rays_of_image(self, points: Points) -> Points:
         """`rays` of pixels (..., 2) of the picture."""
@@ -158,14 +158,19 @@ class Remap:
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):
             raise ValueError(f"points must have shape (..., 2), got {shape}")
-        if self.view.count > 1:
-            raise ValueError("points and boxes belong to one tile: use a map of `tiles`")
         if not isinstance(points, Tensor):
             given = np.asarray(points)
             moved = move(as_tensor(given, torch.float64)[None])[0]
             return moved.numpy().astype(np.result_type(given, np.float32), copy=False)
         moved = move(points[None].to("cpu", torch.float64))[0]
         return moved.to(points.device, torch.promote_types(points.dtype, torch.float32))
+
+    @property
+    def _one(self) -> Any:
+        """The view, which must be of one picture."""
+        if self.view.count > 1:
+            raise ValueError("points and boxes belong to one tile: use a map of remap.tiles")
+        return self._bound
 
     @cached_property
     def _bound(self) -> Any:
