@@ -8,6 +8,7 @@ import resource
 import struct
 import zlib
 from itertools import pairwise
+from pathlib import Path
 
 import hypothesis
 import numpy as np
@@ -24,6 +25,7 @@ from darswin.models import load_model
 # Damaged files of each kind: in `make test`, and in `make fuzz`.
 DAMAGED = 2000 if hypothesis.settings().max_examples <= 30 else 100_000
 COPY, SIZE = 3, (4, 6)
+PAGE = Path(__file__).parents[1] / "docs/reference/files.md"
 
 
 def whole(content: bytes) -> bytes:
@@ -85,8 +87,14 @@ def refused(read, path, words=""):
     assert reason.startswith(start) and re.search(words, reason.removeprefix(start)), reason
 
 
+def test_the_plan_on_the_page_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exec(re.search(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[1], {})
+    assert capsys.readouterr().out == "[[ 85 220]]\n"
+
+
 def test_a_network_by_hand_runs(tmp_path):
-    """From docs/reference/files.md alone; the page itself has a plan."""
+    """From the page alone."""
     header, data = {"__metadata__": network_parts()[1] | {"label.0": "ä", "label.1": "\n"}}, b""
     for name, array in network_parts()[0].items():
         kind = {"i": "I", "f": "F"}[array.dtype.kind] + str(8 * array.itemsize)
