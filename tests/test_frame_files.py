@@ -349,7 +349,7 @@ def test_hostile_instructions_are_refused(step, words, tmp_path):
         ([3, 6, 2**40, 2**40, 1, 6, 1, 0, 1, 6], "more memory"),
         ([1, 6, 2**14, 6, *[2**40] * (2**14 - 1), 1, 0, 1, 6], "more memory"),
         ([1, 6, 2, 6, 2**24, 1, 0, 1, 6], "more memory"),
-        ([1, 6, 1, 6, 1, 0, 1, 6, *[6, 1, 1] * 2**19], "too long"),
+        ([1, 6, 1, 6, 1, 0, 1, 6, *[6, 1, 1] * 2**17], "too long"),
     ],
     ids=lambda value: str(value)[:40],
 )  # fmt: skip

@@ -38,7 +38,7 @@ constexpr int64_t kCopyAxes = 5;
 // All sizes are at least 1, so that no instruction takes more steps than its slots have numbers.
 constexpr int64_t kMostNumbers = int64_t{1} << 40;  // of a program, and of the slots of a run
 constexpr int64_t kMostSlots = 1 << 14;             // of a kind
-constexpr int64_t kMostWords = 1 << 20;             // of a program
+constexpr int64_t kMostWords = 1 << 18;             // of a program
 // A program may always have buffers of so many numbers for an image, 64 MB. More than that must
 // follow from its inputs and its layers.
 constexpr int64_t kFreeNumbers = int64_t{1} << 24;
