@@ -232,28 +232,6 @@ def camera_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     )
 
 
-def attention_table(timings: Sequence[Timing]) -> str:
-    """The fastest peer and eager attention in each mode: a row for each case."""
-    columns = {
-        "forward": ("window_attention", "forward"),
-        "forward+backward": ("window_attention", "forward+backward"),
-        "forward+backward, bfloat16": ("window_attention, bfloat16", "forward+backward"),
-    }
-    rows: dict[tuple[str, int], list[str]] = {}
-    for subject, mode in columns.values():
-        chosen = [t for t in timings if (t.subject, t.mode) == (subject, mode)]
-        for (setting, batch, _), found in by_case(chosen).items():
-            # At each number of threads.
-            peers = zip(*(found[n] for n in found if not n.startswith(OURS)), strict=True)
-            best = [min(those, key=lambda t: t.ratio) for those in peers]
-            row = rows.setdefault(
-                (setting, batch), [f"{setting}, batch {batch}", milliseconds(found[OURS])]
-            )
-            row += [ratios(best), ratios(found["eager"])]
-    heads = [head for mode in columns for head in (f"{mode}: best peer", f"{mode}: eager")]
-    return markdown(["`window_attention`", "ours, forward (ms)", *heads], rows.values())
-
-
 def best_table(
     records: Mapping[str, Sequence[Timing]], rows: Iterable[tuple[str, str, str, int]]
 ) -> str:

@@ -25,6 +25,7 @@ from torch import nn
 from darswin import create_model, frames, list_models, optimize
 from darswin.compat import OfficialDarSwin
 from darswin.deploy import camera, packed
+from darswin.deploy.optimize import optimized
 from darswin.deploy.quantize import quantize_model
 from darswin.lens import Equidistant, Mei, Polynomial
 from darswin.models import Encoder, FeatureMaps, LensAdapter
@@ -106,8 +107,7 @@ def test_quantized_networks_compute_with_8_bits(family, own, tmp_path, monkeypat
     maps = dict(family="darswin_a", features_only=True)
     model = model_of(**maps if family == "maps" else dict(family=family))
     quantized = quantized_of(model)
-    with packed.own_alone():  # oneDNN rounds in another order
-        expected_of = optimize(quantized, torch.int8)
+    expected_of = optimized(quantized, torch.int8, own_alone=True)  # oneDNN rounds otherwise
     monkeypatch.setattr(packed, "has_own_int8", lambda: own)  # False: this CPU has AMX
     network = network_of(quantized, tmp_path)
     frame = random_frame(*network.size, 3, seed=7)
@@ -315,8 +315,7 @@ def test_frames_are_read_without_torch_in_little_memory_on_every_tier(tier, tmp_
     environment = os.environ | {"ATEN_CPU_CAPABILITY": tier}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert_close([np.load(tmp_path / "found.npy")], by_model(model, frame))
-    with packed.own_alone():
-        expected = by_model(optimize(small, torch.int8), frame[:70, :80])
+    expected = by_model(optimized(small, torch.int8, own_alone=True), frame[:70, :80])
     assert_close([np.load(tmp_path / "quantized.npy")], expected, 0.05)
     sampled = sampling(torch.from_numpy(frame[:70, :80])[None], ROUND)
     np.testing.assert_allclose(np.load(tmp_path / "tokens.npy"), sampled[0], atol=1e-5)

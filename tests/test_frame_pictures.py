@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from darswin import frames
 from darswin.deploy import camera
+from darswin.frames.compiled import frames as compiled
 from darswin.lens import Equidistant, KannalaBrandt
 from darswin.views import make_view
 
@@ -130,3 +131,15 @@ def test_plans_are_exact_for_lenses_in_single_precision_too(name):
     view = make_view(name, 30)
     exact = camera.plan(view, LENS.to(torch.float64), SIZE)
     assert camera.plan(view, LENS, SIZE) == exact == view.at(LENS, SIZE).plan("image")
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 4, 8, 9, 1024])
+def test_points_at_the_edges_are_read_inside(side):
+    """Also those that are one rounding before the edge, where a neighbour has no weight."""
+    zero = np.float32(0)
+    picture = np.random.default_rng(0).random((side, side, 2), np.float32) + 1
+    ends = [np.nextafter(np.float32(end), zero) for end in (-1, side - 1, side)]
+    x, y = np.meshgrid([-1, *ends, -1e-9, 0, side - 1, side], [*ends, 0, side - 1])
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    expected = bilinear(picture.astype(np.float64), x.astype(float), y.astype(float))
+    np.testing.assert_allclose(compiled.read(picture, x, y, 1), expected, atol=1e-3)

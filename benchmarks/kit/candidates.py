@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import OneDNN, Own, best_seconds, library, onednn_linear
+from darswin.deploy.packed import Libraries, OneDNN, Own, best_seconds, onednn_linear
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
@@ -137,7 +137,7 @@ def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], T
         return libraries
     weight = layer.weight.detach().to(dtype)
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)
-    ours = library(layer, dtype).linear(layer)
+    ours = Libraries(dtype).of(layer).linear(layer)
     libraries = {"darswin": ours, "torch": lambda x: F.linear(x, weight, bias)}
     if onednn_lack(dtype) is None:
         libraries["onednn"] = onednn_linear(weight, bias)

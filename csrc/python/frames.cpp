@@ -221,8 +221,8 @@ void add_points(const T* picture, int height, int width, int channels, const flo
   for (int64_t i = 0; i < n; ++i) {
     const float x = xs[i], y = ys[i];
     if (!(x > -1 && x < wide && y > -1 && y < high)) continue;
-    // Truncation is the floor of what is above 0.
-    const int column = static_cast<int>(x + 1) - 1, row = static_cast<int>(y + 1) - 1;
+    // The floor. That of x + 1 may round to another pixel, below a power of 2.
+    const int column = x < 0 ? -1 : static_cast<int>(x), row = y < 0 ? -1 : static_cast<int>(y);
     const float right = x - static_cast<float>(column), lower = y - static_cast<float>(row);
     float weights[] = {(1 - lower) * (1 - right), (1 - lower) * right, lower * (1 - right),
                        lower * right};

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from darswin.cli.pictures import ByLens
 from darswin.data.framing import CutOff, FullSize, cut_off, fitted
-from darswin.data.scenes.targets import IGNORE, PER_METRE
+from darswin.data.scenes.targets import PER_METRE
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -25,7 +25,7 @@ from darswin.models.prepared import Prepared
 from darswin.models.saving import ModelCard
 from darswin.ops import _module
 from darswin.utils.files import replace_file
-from darswin.utils.tasks import Fit
+from darswin.utils.tasks import IGNORE, Fit
 from darswin.views import Remap
 from darswin.views.camera import picture_size
 from darswin.viz.pixels import (

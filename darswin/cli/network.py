@@ -17,7 +17,6 @@ from darswin import boxes
 from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_overlay
 from darswin.cli.names import read_names
 from darswin.cli.views import named_view
-from darswin.data.scenes.targets import IGNORE
 from darswin.frames import Sampler
 from darswin.frames.onnx import Detections, OnnxNetwork
 from darswin.lens import Lens
@@ -25,6 +24,7 @@ from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
+from darswin.utils.tasks import IGNORE
 from darswin.views import PlainView, Remap
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 

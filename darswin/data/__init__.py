@@ -11,9 +11,9 @@ from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import IGNORE
 from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import WideAngle
+from darswin.utils.tasks import IGNORE
 
 __all__ = [
     "IGNORE",

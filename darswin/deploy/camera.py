@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from darswin.deploy.forward import NoProgramError, frame_program
-from darswin.deploy.optimize import check_model, optimize
-from darswin.deploy.packed import own_alone
+from darswin.deploy.networks import frame_program
+from darswin.deploy.optimize import check_model, optimized
+from darswin.deploy.program import NoProgramError
 from darswin.frames.plans import Output, Plan, check_output, check_size
 from darswin.frames.tensor_file import check_name, write_tensors
 from darswin.layers.quantized import quantized_layers
@@ -114,9 +114,10 @@ def export_network(
     else:
         places = _every_pixel(model, size, form)
     try:
-        with torch.no_grad(), own_alone():
-            fast = optimize(model, torch.int8 if quantized_layers(model) else torch.float32)
-            program = frame_program(fast, fast.prepare(lens, size))
+        with torch.no_grad():
+            dtype = torch.int8 if quantized_layers(model) else torch.float32
+            fast = optimized(model, dtype, own_alone=True)
+            program = frame_program(fast, lens, size)
     except NoProgramError as error:
         raise TypeError(
             f"model must be a classifier, a backbone or a Unet that a file can contain, got "

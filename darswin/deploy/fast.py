@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from darswin.deploy.own import OwnLinear, OwnNorm, pack
-from darswin.deploy.packed import InDtype, Layer, Own, OwnBlocks, library, refuse_gradients
+from darswin.deploy.packed import InDtype, Layer, Libraries, Own, OwnBlocks, refuse_gradients
 from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
@@ -24,18 +24,18 @@ CACHED_BYTES = 16 * 2**20
 
 
 @singledispatch
-def fast(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
+def fast(layer: nn.Module, libraries: Libraries) -> nn.Module:
     """The layer that takes the place of another one. A kind of layer that is not registered here
     stays, with fast layers in it."""
     for name, part in layer.named_children():
-        layer.add_module(name, fast(part, dtype))
+        layer.add_module(name, fast(part, libraries))
     return layer
 
 
 @fast.register
-def _(unet: Unet, dtype: torch.dtype) -> nn.Module:
+def _(unet: Unet, libraries: Libraries) -> nn.Module:
     for part in (unet.encoder, unet.decoder, unet.head):  # the places of tokens stay in float32
-        fast(part, dtype)
+        fast(part, libraries)
     return unet
 
 
@@ -51,29 +51,30 @@ class FastLayer(nn.Module):
 
 
 @fast.register
-def _(linear: nn.Linear, dtype: torch.dtype) -> nn.Module:
-    return FastLayer(library(linear, dtype).linear(linear))
+def _(linear: nn.Linear, libraries: Libraries) -> nn.Module:
+    return FastLayer(libraries.of(linear).linear(linear))
 
 
 @fast.register
-def _(layer: QuantizedLinear, dtype: torch.dtype) -> nn.Module:
+def _(layer: QuantizedLinear, libraries: Libraries) -> nn.Module:
     raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
 
 
 @fast.register
-def _(norm: nn.LayerNorm, dtype: torch.dtype) -> nn.Module:
-    return FastLayer(library(norm, dtype).norm(norm))
+def _(norm: nn.LayerNorm, libraries: Libraries) -> nn.Module:
+    return FastLayer(libraries.of(norm).norm(norm))
 
 
 @fast.register(PatchProjection)
 @fast.register(nn.Conv2d)
-def _(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
-    return InDtype(layer, dtype)
+def _(layer: nn.Module, libraries: Libraries) -> nn.Module:
+    return InDtype(layer, libraries.dtype)
 
 
 @fast.register
-def _(embed: PatchEmbed, dtype: torch.dtype) -> nn.Module:
-    return FastPatchEmbed(embed) if dtype == torch.float32 else InDtype(embed, dtype)
+def _(embed: PatchEmbed, libraries: Libraries) -> nn.Module:
+    own = libraries.dtype == torch.float32
+    return FastPatchEmbed(embed) if own else InDtype(embed, libraries.dtype)
 
 
 class FastPatchEmbed(nn.Module):
@@ -96,20 +97,23 @@ class FastPatchEmbed(nn.Module):
 
 
 @fast.register
-def _(block: ConvBlock, dtype: torch.dtype) -> nn.Module:
+def _(block: ConvBlock, libraries: Libraries) -> nn.Module:
     conv1, norm1, relu, conv2, norm2, _ = list[Any](block)
     first, second = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
-    return nn.Sequential(InDtype(first, dtype), relu, InDtype(second, dtype), relu)
+    return nn.Sequential(
+        InDtype(first, libraries.dtype), relu, InDtype(second, libraries.dtype), relu
+    )
 
 
 @fast.register(PolarPatchEmbed)
 class FastEmbed(nn.Module):
     """The embedding of samples, in float32."""
 
-    def __init__(self, embed: PolarPatchEmbed, dtype: torch.dtype):
+    def __init__(self, embed: PolarPatchEmbed, libraries: Libraries):
         super().__init__()
-        self.proj, self.norm = Own().linear(embed.proj), Own().norm(embed.norm)
-        self.dtype = dtype
+        own = Own(libraries.weights)
+        self.proj, self.norm = own.linear(embed.proj), own.norm(embed.norm)
+        self.dtype = libraries.dtype
 
     def forward(self, x: Tensor) -> Tensor:
         refuse_gradients(x)
@@ -120,10 +124,10 @@ class FastEmbed(nn.Module):
 class FastMerging(PatchMerging):
     """The merging of tokens, with the norm and the product of a library."""
 
-    def __init__(self, merging: PatchMerging, dtype: torch.dtype):
+    def __init__(self, merging: PatchMerging, libraries: Libraries):
         nn.Module.__init__(self)
         self.merge = merging.merge
-        self.product = library(merging, dtype).linear(merging.reduction, merging.norm)
+        self.product = libraries.of(merging).linear(merging.reduction, merging.norm)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.product(self.joined(x))
@@ -134,17 +138,17 @@ class FastStage(nn.Module):
     """A stage whose blocks a library computes, in parts if the batch is large. Our own operator
     takes parts itself."""
 
-    def __init__(self, stage: Stage, dtype: torch.dtype):
+    def __init__(self, stage: Stage, libraries: Libraries):
         super().__init__()
-        self.downsample = fast(stage.downsample, dtype)
+        self.downsample = fast(stage.downsample, libraries)
         blocks: list[Any] = list(stage.blocks)
         if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
             raise ValueError("both products of an MLP must be quantized, or none")
-        self.blocks = library(stage.blocks, dtype).blocks(blocks)
+        self.blocks = libraries.of(stage.blocks).blocks(blocks)
         layers = [block.mlp.fc1 for block in blocks]
         # The widest tokens are queries, keys and values, or those within the MLP.
         widest = max([3, *(-(-layer.out_features // layer.in_features) for layer in layers)])
-        self.most_numbers = max(CACHED_BYTES // (widest * dtype.itemsize), 1)
+        self.most_numbers = max(CACHED_BYTES // (widest * libraries.dtype.itemsize), 1)
         biases = [block.attn.position_bias for block in blocks]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         self.heads = [bias.heads for bias in relative]

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
-from darswin.deploy.forward import Run, compiled
-from darswin.deploy.packed import fastest_dtype
+from darswin.deploy.networks import Programs
+from darswin.deploy.packed import Libraries, OneDNN, fastest_dtype
+from darswin.deploy.program import NoProgramError, Weights
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
@@ -38,6 +39,7 @@ def optimize(
     *,
     lens: Lens | None = None,
     batches: Iterable[Sequence] | None = None,
+    strict: bool = False,
 ) -> Net:
     """A copy of a model that computes the same results faster, for inference on CPUs.
 
@@ -57,16 +59,27 @@ def optimize(
             size.
         batches: of (images, lens), typical pictures. With int8, they quantize a model that is not
             quantized yet.
+        strict: refuses a model of float32 or int8 that cannot be one program. Without it, such a
+            model runs layer by layer, which is slower, and its `repr` says why.
 
     Warns if torch lacks oneDNN's bfloat16 products. The copy then uses torch's own, which are
     slower.
 
     Raises:
-        TypeError: another kind of model.
+        TypeError: another kind of model; or with `strict`, one with a part that is no instruction
+            of a program, or a dtype or library that has no programs.
         ValueError: an unsupported dtype or device; a `lens` that is not a single lens; batches
             without int8 or for a quantized model; int8 with neither.
         ImportError: darswin's compiled module cannot be loaded.
     """
+    return optimized(model, dtype, lens, batches, strict=strict)
+
+
+def optimized(
+    model: Net, dtype: torch.dtype | Literal["fastest"] = torch.float32, lens: Lens | None = None,
+    batches: Iterable[Sequence] | None = None, *, strict: bool = False, own_alone: bool = False,
+) -> Net:  # fmt: skip
+    """`optimize`; own_alone: by our own operators, where oneDNN is faster too."""
     check_model(model, dtype, lens)
     _module.require("optimize")
     if dtype == "fastest":
@@ -77,17 +90,27 @@ def optimize(
     elif batches is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
-        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
-    optimized = copy.deepcopy(model).eval().requires_grad_(False).float()
-    fast(optimized, dtype)
-    for part in optimized.modules():
+        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=3)
+    libraries = Libraries(dtype, own_alone=own_alone)
+    by_onednn = isinstance(libraries.of(model), OneDNN)
+    made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
+    fast(made, libraries)
+    for part in made.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
-            if dtype == torch.float32 and part is optimized:
-                vars(part).update(compiled=compiled(part))
-    return optimized
+    vars(made).update(weights=libraries.weights)
+    try:
+        if by_onednn:
+            raise NoProgramError("the library oneDNN, which computes its products faster here")
+        vars(made).update(programs=Programs(made, made.layers, libraries.weights))
+    except NoProgramError as error:
+        lack = f"layer by layer, because of {error}"
+        if strict:
+            raise TypeError(f"model must become one program, but it runs {lack}") from error
+        vars(made).update(lack=lack)
+    return made
 
 
 def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:
@@ -124,12 +147,19 @@ class Optimized(Model[Any]):
     dtype = torch.float32  # of the original weights
     fixed_lens: Lens | None = None
     known: dict[Pair, Prepared]  # the result of `prepare` for the fixed lens and each size
-    compiled: Run | None = None  # `forward_network` as programs
+    programs: Programs | None = None  # `forward_network` as programs
+    lack: str = ""  # why there are none
+    weights: Weights  # of its programs
+
+    @property
+    def layers(self) -> Any:
+        """The methods of the model, which go layer by layer."""
+        return super()
 
     def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
-        if self.compiled is None:
+        if self.programs is None:
             return super().forward_network(x, prepared, images)
-        return self.compiled(x, prepared, images)
+        return self.programs(x, prepared, images)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         if self.fixed_lens is None:
@@ -143,6 +173,9 @@ class Optimized(Model[Any]):
     def _check_device(self, name: str, images: Tensor) -> None:
         if not images.is_cpu:
             raise ValueError(f"{name} must be on the CPU, as the model is, got {images.device}")
+
+    def extra_repr(self) -> str:
+        return ", ".join(filter(None, (super().extra_repr(), self.lack)))
 
     def train(self, mode: bool = True) -> Self:
         if mode:

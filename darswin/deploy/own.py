@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 import darswin.ops  # noqa: F401  (it registers our operators)
 from darswin.layers.quantized import Quantization, quantized_layers
@@ -64,6 +65,8 @@ class OwnLinear:
             self._given = (*self._given, norm.parameters, norm.eps)
 
     def __call__(self, x: Tensor) -> Tensor:
+        if has_torch_function_unary(x):
+            return handle_torch_function(OwnLinear.__call__, (x,), self, x)
         return _LINEAR(x, *self._given)
 
 
@@ -78,6 +81,8 @@ class OwnNorm:
         self.parameters = norm_parameters(norm)
 
     def __call__(self, x: Tensor) -> Tensor:
+        if has_torch_function_unary(x):
+            return handle_torch_function(OwnNorm.__call__, (x,), self, x)
         return _NORM(x, self.parameters, self.eps)
 
 

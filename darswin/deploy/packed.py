@@ -5,14 +5,14 @@ They are plain callables: a module would take a microsecond more for each call.
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, partial
 from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.deploy.own import (
     OwnLinear,
@@ -51,25 +51,15 @@ def has_own_int8() -> bool:
     return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
-_OWN_ALONE = ContextVar("own_alone", default=False)
-
-
-@contextlib.contextmanager
-def own_alone() -> Iterator[None]:
-    """Within this context, `library` chooses our own operators where oneDNN is faster too."""
-    token = _OWN_ALONE.set(True)
-    try:
-        yield
-    finally:
-        _OWN_ALONE.reset(token)
-
-
 class OwnBlocks(PackedBlocks):
-    """The blocks of a stage by one operator."""
+    """The blocks of a stage by one operator; weights: those of the whole model."""
 
-    def __init__(self, blocks: Sequence[Any]):
+    def __init__(self, blocks: Sequence[Any], weights: Weights):
         super().__init__(blocks)
-        self.weights = Weights()  # or those of a whole model
+        self.weights = weights
+        for of_block in self.layers:
+            for layer in of_block:
+                weights.offset(layer.words if isinstance(layer, OwnNorm) else layer)
 
     @cached_property
     def words(self) -> list[int]:
@@ -77,18 +67,24 @@ class OwnBlocks(PackedBlocks):
         program = Program(self.weights)
         x = program.input(*self.map_shape)
         tables = [program.input(*shape) for shape in self.table_shapes]
-        out = program.permuted(x, self.map_shape, (0, 1, 2), *self.map_shape)
-        program.blocks(out, self, tables)
-        program.output(out)
+        program.output(program.blocks(x, self, tables))
         return program.words()
 
     def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        if has_torch_function_unary(x):
+            return handle_torch_function(OwnBlocks.__call__, (x,), self, x, tables)
         words = self.words
         return RUN([x, *tables], self.weights.words, words)[0]
 
 
 class Own:
-    """Our own operators, in float32 and, if `has_own_int8`, of quantized layers."""
+    """Our own operators, in float32 and, if `has_own_int8`, of quantized layers.
+
+    Args: weights: of the programs of a model; None for layers alone.
+    """
+
+    def __init__(self, weights: Weights | None = None):
+        self.weights = Weights() if weights is None else weights
 
     def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
         """A linear layer, behind a norm or before a GELU if asked."""
@@ -102,8 +98,8 @@ class Own:
     def blocks(self, blocks: Sequence[Any]) -> Blocks:
         """The blocks of a stage: one operator, if all of them have window attention."""
         if not blocks or not all(_has_windows(block.attn) for block in blocks):
-            return OneDNN(torch.float32).blocks(blocks)
-        return OwnBlocks(blocks)
+            return OneDNN(torch.float32, self.weights).blocks(blocks)
+        return OwnBlocks(blocks, self.weights)
 
 
 class OneDNN(Own):
@@ -113,7 +109,8 @@ class OneDNN(Own):
     product, torch computes those in bfloat16, and our own operators those of quantized layers.
     """
 
-    def __init__(self, dtype: torch.dtype):
+    def __init__(self, dtype: torch.dtype, weights: Weights | None = None):
+        super().__init__(weights)
         self.dtype = dtype
 
     def linear(
@@ -205,12 +202,26 @@ class OneDNN(Own):
         return lambda x, table: proj(attend(qkv(x).unflatten(-1, sizes), table, *given))
 
 
-def library(layer: nn.Module, dtype: torch.dtype) -> Own:
-    """The library that computes a layer, or a part of a model, fastest here."""
-    own = dtype == torch.float32 and (
-        not quantized_layers(layer) or has_own_int8() or _OWN_ALONE.get()
-    )
-    return Own() if own else OneDNN(dtype)
+class Libraries:
+    """The libraries that compute the parts of a model fastest here.
+
+    Args:
+        dtype: of the maps between the layers.
+        own_alone: chooses our own operators where oneDNN is faster too.
+
+    Attributes:
+        weights: of the programs of the model.
+    """
+
+    def __init__(self, dtype: torch.dtype, *, own_alone: bool = False):
+        self.dtype, self.weights, self._own_alone = dtype, Weights(), own_alone
+
+    def of(self, layer: nn.Module) -> Own:
+        """The library of a layer, or of a part of a model."""
+        own = self.dtype == torch.float32 and (
+            not quantized_layers(layer) or self._own_alone or has_own_int8()
+        )
+        return Own(self.weights) if own else OneDNN(self.dtype, self.weights)
 
 
 def _has_windows(attn: nn.Module) -> bool:
@@ -299,7 +310,7 @@ def fastest_dtype() -> torch.dtype:
     x = torch.ones(512, 384)
     linear = nn.utils.skip_init(nn.Linear, 384, 1536)  # which draws no random numbers
     nn.init.ones_(linear.weight)
-    runs = {d: partial(library(linear, d).linear(linear), x.to(d)) for d in dtypes}
+    runs = {d: partial(Libraries(d).of(linear).linear(linear), x.to(d)) for d in dtypes}
     with torch.inference_mode():
         seconds = best_seconds(runs, turns=9)
     return min(seconds, key=seconds.__getitem__)

@@ -2,19 +2,26 @@
 
 import struct
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from darswin.deploy.own import OwnLinear, OwnNorm, PackedBlocks, own_operator, pack
 
 RUN = own_operator("_run")
 
 LINEAR, NORM, BLOCK, COPY, ADD, MEAN, GELU, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE = range(12)
-NOTHING, AND_GELU, AND_ADD = range(3)  # what follows a product
+NOTHING, AND_GELU = range(2)  # what follows a product
+COPY_AXES = 5
+
+
+class NoProgramError(Exception):
+    """The model has a part that is no instruction."""
+
+    # No TypeError: torch's `x + y` would take that for an operand that it does not support.
 
 
 class Slot(NamedTuple):
@@ -23,6 +30,11 @@ class Slot(NamedTuple):
     is_buffer: bool
     number: int
     shape: tuple[int, ...]  # of one image
+
+    @property
+    def key(self) -> tuple[bool, int]:
+        """What tells it from other slots."""
+        return self.is_buffer, self.number
 
     @property
     def rows(self) -> int:
@@ -36,51 +48,69 @@ class Slot(NamedTuple):
 
 
 class Weights:
-    """Packed weights, one after the other in one tensor. Programs share them."""
+    """Packed weights, one after the other in one tensor. The programs of a model share them."""
 
     def __init__(self) -> None:
         self._pieces: list[Tensor] = []
         self._offsets: dict[int, int] = {}
         self._count = 0
-        self._convs: dict[int, Tensor] = {}
+        self._convs: dict[int, tuple[Tensor, Tensor]] = {}
+        self._words = torch.zeros(0, dtype=torch.int32)
 
-    def of_conv(self, layer: nn.Conv2d) -> Tensor:
+    def of_conv(self, weight: Tensor, bias: Tensor | None) -> Tensor:
         """The packed words of a convolution, the inner order of whose depth is (y, x, channel)."""
-        if id(layer) not in self._convs:
-            rows = layer.weight.permute(0, 2, 3, 1).flatten(1)
-            self._convs[id(layer)] = pack(rows, layer.bias)
-        return self._convs[id(layer)]
+        if id(weight) not in self._convs:
+            rows = weight.permute(0, 2, 3, 1).flatten(1)
+            self._convs[id(weight)] = weight, pack(rows, bias)
+        return self._convs[id(weight)][1]
 
     def offset(self, piece: Tensor) -> int:
         """The place of packed words of 32 bits, which are added if they are new."""
         if id(piece) not in self._offsets:
-            assert "words" not in vars(self), "a piece is new to weights that are joined already"
             self._offsets[id(piece)] = self._count
             self._pieces.append(piece)
             self._count += piece.numel()
         return self._offsets[id(piece)]
 
-    @cached_property
+    @property
     def words(self) -> Tensor:
-        """All words, (K,) int32. Nothing new is added after. The pieces become views of them, so
-        they take no memory twice."""
-        pieces = [piece.flatten().view(torch.int32) for piece in self._pieces]
-        words = torch.cat(pieces)
-        for piece in self._pieces:
-            place = self._offsets[id(piece)]
-            piece.set_(words.untyped_storage(), place, piece.shape, piece.stride())
-        return words
+        """All words, (K,) int32. The pieces become views of them, so they take no memory twice."""
+        if len(self._words) != self._count:
+            self._words = torch.cat([piece.flatten().view(torch.int32) for piece in self._pieces])
+            for piece in self._pieces:
+                storage, place = self._words.untyped_storage(), self._offsets[id(piece)]
+                piece.set_(storage, place, piece.shape, piece.stride())
+        return self._words
+
+
+@dataclass
+class Step:
+    """An instruction. Its arguments that are slots are what it reads and `out`.
+
+    If there is a `base`, the instruction changes numbers in place: those of the slot `base`, of
+    which `out` is the new name.
+    """
+
+    opcode: int
+    out: Slot
+    reads: Sequence[Slot]
+    arguments: Sequence[Any]
+    base: Slot | None = None
 
 
 class Program:
-    """Instructions, written one after the other. Maps are channels last."""
+    """Instructions, written one after the other. Maps are channels last.
+
+    Each instruction writes a slot of its own. `words` lets it take the memory of the slot that it
+    changes, if nobody reads that any more.
+    """
 
     def __init__(self, weights: Weights):
         self.weights = weights
         self._inputs: list[Slot] = []
         self._buffers: list[Slot] = []
         self._outputs: list[Slot] = []
-        self._steps: list[tuple[int, tuple]] = []
+        self._steps: list[Step] = []
 
     def input(self, *shape: int) -> Slot:
         """The next input, of this shape for one image."""
@@ -93,41 +123,80 @@ class Program:
         return self._buffers[-1]
 
     def output(self, slot: Slot) -> None:
-        """Makes a buffer the next output."""
+        """Makes the numbers of a slot the next output, in its shape."""
+        if not slot.is_buffer or slot.key in {output.key for output in self._outputs}:
+            slot = self.permuted(slot, slot.shape, range(len(slot.shape)), *slot.shape)
         self._outputs.append(slot)
 
     def words(self) -> list[int]:
         """The program as one array of integers."""
-        head = [slot.numbers for slot in self._inputs], [slot.numbers for slot in self._buffers]
-        words = [len(head[0]), *head[0], len(head[1]), *head[1], len(self._outputs)]
+        steps, place = self._in_place()
+        numbers = {slot.key: k for k, slot in enumerate(self._inputs)}
+        used = [slot for slot in self._buffers if place.get(slot.key, slot.key) == slot.key]
+        numbers |= {slot.key: len(self._inputs) + k for k, slot in enumerate(used)}
+        buffer = {slot.key: k for k, slot in enumerate(used)}
+
+        def number(slot: Slot) -> int:
+            return numbers[place.get(slot.key, slot.key)]
+
+        words = [len(self._inputs), *(slot.numbers for slot in self._inputs)]
+        words += [len(used), *(slot.numbers for slot in used), len(self._outputs)]
         for output in self._outputs:
-            words += [output.number, len(output.shape), *output.shape]
-        for opcode, arguments in self._steps:
-            numbers = [
-                len(self._inputs) * a.is_buffer + a.number if isinstance(a, Slot) else int(a)
-                for a in arguments
-            ]
-            words += [opcode, len(numbers), *numbers]
+            words += [buffer[place.get(output.key, output.key)], len(output.shape), *output.shape]
+        for step in steps:
+            arguments = [number(a) if isinstance(a, Slot) else int(a) for a in step.arguments]
+            words += [step.opcode, len(arguments), *arguments]
         return words
 
-    def _step(self, opcode: int, *arguments: Any) -> None:
-        self._steps.append((opcode, arguments))
+    def _in_place(self) -> tuple[list[Step], dict[tuple[bool, int], tuple[bool, int]]]:
+        """The steps, of which those with a `base` change it in place or a copy of it; and the
+        buffer whose memory a buffer takes."""
+        last = {slot.key: k for k, step in enumerate(self._steps) for slot in step.reads}
+        last |= {slot.key: len(self._steps) for slot in self._outputs}
+        steps: list[Step] = []
+        place: dict[tuple[bool, int], tuple[bool, int]] = {}
+        made: dict[tuple[bool, int], Step] = {}
+        for k, step in enumerate(self._steps):
+            base, free = step.base, step.base is not None and last[step.base.key] == k
+            if step.opcode == ADD:
+                base, other = step.reads
+                if not (base.is_buffer and free):  # then perhaps the other summand
+                    base, other = other, base
+                free = last[base.key] == k and base.key != other.key
+                step = replace(step, base=base, arguments=(other, step.out))
+            if base is not None and base.is_buffer and free:
+                place[step.out.key] = place.get(base.key, base.key)
+                before = made.get(base.key)
+                if step.opcode == GELU and before is not None and before.opcode == CONV:
+                    before.arguments = (*before.arguments[:-1], AND_GELU)
+                    continue
+            elif base is not None and step.opcode != NORM:
+                steps.append(_copied(base, step.out))
+            steps.append(step)
+            made[step.out.key] = step
+        return steps, place
+
+    def _step(
+        self, opcode: int, out: Slot, reads: Sequence[Slot], *arguments: Any,
+        base: Slot | None = None,
+    ) -> Slot:  # fmt: skip
+        self._steps.append(Step(opcode, out, reads, arguments, base))
+        return out
 
     def linear(self, x: Slot, layer: OwnLinear) -> Slot:
         """A linear layer, with its norm and its GELU if it has them."""
         out = self.buffer(*x.shape[:-1], layer.columns)
         norm = -1 if layer.norm is None else self._norm_offset(layer.norm)
-        self._step(
-            LINEAR, x, out, x.rows, x.shape[-1], layer.columns, *self._layer(layer.packed), norm,
-            layer.gelu,
+        return self._step(
+            LINEAR, out, [x], x, out, x.rows, x.shape[-1], layer.columns,
+            *self._layer(layer.packed), norm, layer.gelu,
         )  # fmt: skip
-        return out
 
-    def norm(self, x: Slot, norm: OwnNorm, out: Slot | None = None) -> Slot:
-        """A layer norm of tokens as wide as the norm, in place unless `out` is given."""
-        out, dim = out or x, norm.parameters.shape[1]
-        self._step(NORM, x, out, x.numbers // dim, dim, self._norm_offset(norm))
-        return out
+    def norm(self, x: Slot, norm: OwnNorm) -> Slot:
+        """A layer norm of tokens as wide as the norm."""
+        out, dim = self.buffer(*x.shape), norm.parameters.shape[1]
+        offset = self._norm_offset(norm)
+        return self._step(NORM, out, [x], x, out, x.numbers // dim, dim, offset, base=x)
 
     def _layer(self, packed: Tensor) -> tuple[int, bool]:
         """The place of a packed layer, and whether it is quantized."""
@@ -136,16 +205,20 @@ class Program:
     def _norm_offset(self, norm: OwnNorm) -> int:
         return self.weights.offset(norm.words)
 
-    def blocks(self, x: Slot, blocks: PackedBlocks, tables: Sequence[Slot]) -> None:
-        """The blocks of a stage, in place."""
-        rings, sectors, dim = x.shape
+    def blocks(self, x: Slot, blocks: PackedBlocks, tables: Sequence[Slot]) -> Slot:
+        """The blocks of a stage."""
+        (rings, sectors, dim), out = x.shape, self.buffer(*x.shape)
+        base: Slot | None = x
         steps = zip(blocks.layers, blocks.windows, tables, strict=True)
         for (norm1, qkv, proj, norm2, fc1, fc2), windows, table in steps:
             self._step(
-                BLOCK, x, rings, sectors, dim, blocks.heads, blocks.mlp_dim,
-                self._norm_offset(norm1), *self._layer(qkv), *self._layer(proj),
+                BLOCK, out, [x if base else out, table], out, rings, sectors, dim, blocks.heads,
+                blocks.mlp_dim, self._norm_offset(norm1), *self._layer(qkv), *self._layer(proj),
                 self._norm_offset(norm2), *self._layer(fc1), *self._layer(fc2), *windows, table,
+                base=base,
             )  # fmt: skip
+            base = None
+        return out
 
     def copy(
         self,
@@ -159,109 +232,72 @@ class Program:
     ) -> Slot:
         """Copies an array of up to five axes between places with these strides; `begin` and `to`
         are where reading and writing begin."""
+        if len(sizes) > COPY_AXES:
+            raise NoProgramError(f"a copy with {len(sizes)} axes is no instruction")
         axes = zip(sizes, reads, writes, strict=True)
-        padded = [(1, 0, 0)] * (5 - len(sizes)) + list(axes)
-        self._step(COPY, x, out, begin, to, *chain.from_iterable(zip(*padded, strict=True)))
-        return out
+        padded = [(1, 0, 0)] * (COPY_AXES - len(sizes)) + list(axes)
+        places = chain.from_iterable(zip(*padded, strict=True))
+        return self._step(COPY, out, [x], x, out, begin, to, *places)
 
     def permuted(self, x: Slot, sizes: Sequence[int], order: Sequence[int], *shape: int) -> Slot:
         """The axes of x, which has these sizes, in another order, as a new buffer of a shape."""
-        reads, writes = (
-            _strides(sizes),
-            dict(zip(order, _strides([sizes[axis] for axis in order]), strict=True)),
-        )
-        moved = [sizes[axis] for axis in order]
+        reads, moved = _strides(sizes), [sizes[axis] for axis in order]
         return self.copy(
-            x, self.buffer(*shape), moved, [reads[axis] for axis in order],
-            [writes[axis] for axis in order],
-        )  # fmt: skip
+            x, self.buffer(*shape), moved, [reads[axis] for axis in order], _strides(moved)
+        )
 
-    def joined(self, *maps: Slot) -> Slot:
-        """Maps of the same tokens, side by side."""
-        width = sum(x.shape[-1] for x in maps)
-        out, begin = self.buffer(*maps[0].shape[:-1], width), 0
-        for x in maps:
-            own = x.shape[-1]
-            self.copy(x, out, (x.rows, own), (own, 1), (width, 1), begin)
-            begin += own
-        return out
-
-    def around(self, x: Slot) -> Slot:
-        """A map with its last column before its first, and its first after its last."""
-        rows, columns, channels = x.shape
-        out = self.buffer(rows, columns + 2, channels)
-        reads, writes = (columns * channels, 1), ((columns + 2) * channels, 1)
-        last = (columns - 1) * channels
-        self.copy(x, out, (rows, columns * channels), reads, writes, channels)
-        self.copy(x, out, (rows, channels), reads, writes, 0, begin=last)
-        return self.copy(x, out, (rows, channels), reads, writes, last + 2 * channels)
-
-    def channels_last(self, *images: Slot) -> Slot:
-        """Images (C, H, W) of the same size, joined to one map (H, W, C)."""
-        width, (_, rows, columns) = sum(x.shape[0] for x in images), images[0].shape
-        out, begin, pixels = self.buffer(rows, columns, width), 0, rows * columns
-        for x in images:
-            self.copy(x, out, (pixels, x.shape[0]), (1, pixels), (width, 1), begin)
-            begin += x.shape[0]
-        return out
-
-    def channels_first(self, x: Slot) -> Slot:
-        """A map (H, W, C) as (C, H, W)."""
-        return self.permuted(x, x.shape, (2, 0, 1), x.shape[2], *x.shape[:2])
-
-    def added(self, x: Slot, to: Slot) -> Slot:
-        """Adds x to a buffer."""
-        self._step(ADD, x, to)
-        return to
+    def added(self, x: Slot, y: Slot) -> Slot:
+        """The sum of two slots."""
+        out = self.buffer(*x.shape)
+        return self._step(ADD, out, [x, y], y, out, base=x)
 
     def mean(self, x: Slot) -> Slot:
         """The mean of the tokens."""
         out = self.buffer(x.shape[-1])
-        self._step(MEAN, x, out, x.rows, x.shape[-1])
-        return out
+        return self._step(MEAN, out, [x], x, out, x.rows, x.shape[-1])
 
     def gelu(self, x: Slot) -> Slot:
-        """The GELU, in place."""
-        self._step(GELU, x)
-        return x
+        """The GELU."""
+        out = self.buffer(*x.shape)
+        return self._step(GELU, out, [x], out, base=x)
 
-    def conv(self, x: Slot, layer: nn.Conv2d, after: int, out: Slot | None = None) -> Slot:
-        """A convolution of 3 × 3; after `AND_ADD` it is added to `out`."""
-        height, width, channels = x.shape
-        out = out or self.buffer(height, width, layer.out_channels)
-        self._step(
-            CONV, x, out, height, width, channels, layer.out_channels,
-            self.weights.offset(self.weights.of_conv(layer)), after,
+    def conv(self, x: Slot, weight: Tensor, bias: Tensor | None) -> Slot:
+        """A convolution of 3 × 3."""
+        (height, width, channels), columns = x.shape, weight.shape[0]
+        out, packed = self.buffer(height, width, columns), self.weights.of_conv(weight, bias)
+        return self._step(
+            CONV, out, [x], x, out, height, width, channels, columns, self.weights.offset(packed),
+            NOTHING,
         )  # fmt: skip
-        return out
 
     def resized(self, x: Slot, size: Sequence[int]) -> Slot:
         """A map in another size, bilinearly, as `F.interpolate`."""
         height, width, channels = x.shape
-        if (height, width) == tuple(size):
-            return x
         out = self.buffer(*size, channels)
-        self._step(RESIZE, x, out, height, width, *size, channels)
-        return out
+        return self._step(RESIZE, out, [x], x, out, height, width, *size, channels)
 
     def sampled(self, x: Slot, points: Slot) -> Slot:
         """A map at points (H', W', 2) between its pixels, 0 outside."""
-        height, width, channels = x.shape
-        out = self.buffer(*points.shape[:2], channels)
-        self._step(SAMPLE, x, out, height, width, *points.shape[:2], channels, points)
-        return out
+        (height, width, channels), size = x.shape, points.shape[:2]
+        out = self.buffer(*size, channels)
+        return self._step(SAMPLE, out, [x, points], x, out, height, width, *size, channels, points)
 
     def to_image(self, x: Slot, plan: Slot) -> Slot:
         """A polar map at the pixels of the images, by a plan (H, 3, W)."""
         height, _, width = plan.shape
         out = self.buffer(height, width, x.shape[-1])
-        self._step(TO_IMAGE, x, out, *x.shape, height, width, plan)
-        return out
+        return self._step(TO_IMAGE, out, [x, plan], x, out, *x.shape, height, width, plan)
 
     def distance(self, x: Slot, typical: float) -> Slot:
-        """The distances of a `DistanceHead`, in place."""
-        self._step(DISTANCE, x, *struct.unpack("<i", struct.pack("<f", typical)))
-        return x
+        """The distances of a `DistanceHead`."""
+        bits, out = struct.unpack("<i", struct.pack("<f", typical)), self.buffer(*x.shape)
+        return self._step(DISTANCE, out, [x], out, *bits, base=x)
+
+
+def _copied(x: Slot, out: Slot) -> Step:
+    padding = [1] * (COPY_AXES - 1), [0] * (COPY_AXES - 1)
+    sizes, (reads, writes) = [*padding[0], x.numbers], [[*padding[1], 1]] * 2
+    return Step(COPY, out, [x], (x, out, 0, 0, *sizes, *reads, *writes))
 
 
 def _strides(sizes: Sequence[int]) -> list[int]:

@@ -40,7 +40,7 @@ class Frames(Protocol):
         supersampling: int,
         /,
     ) -> Sample:
-        """A function that samples frames at the places of a plan."""
+        """A function that samples frames at the points of a plan."""
 
     @staticmethod
     def network(

@@ -192,7 +192,7 @@ class Plan:
 
     @cached_property
     def _tables(self) -> np.ndarray:
-        """The places of the points, (n, k·H', k·W', 2), NaN outside of the frame."""
+        """The points, (n, k·H', k·W', 2), NaN outside of the frame."""
         if self.output == "tokens":
             raise ValueError("a plan of tokens has no pixels that could be carried to the frame")
         places = np.stack((self.columns + self.right, self.rows + self.lower), -1)
@@ -269,7 +269,7 @@ def check_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 class Sampler:
-    """Samples frames at the places of a plan: `sampler(frame, out=None, threads=1)`.
+    """Samples frames at the points of a plan: `sampler(frame, out=None, threads=1)`.
 
     A call takes a frame of uint8, (H, W, 3) or (H, W), in any memory layout, so that
     `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It

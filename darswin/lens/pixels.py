@@ -3,6 +3,7 @@
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.lens.base import Lens
 from darswin.lens.solve import determinant, length_of, vector_of
@@ -39,9 +40,8 @@ def ray_channels(theta: Tensor, direction: Tensor) -> Tensor:
     Returns:
         The unit vectors (x, y, z), (N, 3, H, W); 0 where θ is NaN.
     """
-    seen = ~theta.isnan()
-    rays = vector_of(torch.where(seen, theta, 0.0), direction)  # NaN must not reach the gradients
-    return torch.where(seen[..., None], rays, 0.0).permute(0, 3, 1, 2)
+    rays = torch.where(theta.isnan()[..., None], 0.0, vector_of(theta, direction))
+    return rays.permute(0, 3, 1, 2)
 
 
 def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
@@ -128,6 +128,8 @@ def as_map(pixels: Tensor) -> Tensor:
 def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     """Samples images (B, C, H, W) at pixels (B or 1, H', W', 2), bilinearly and with 0 outside:
     (B, C, H', W') on the images' device and in their dtype. Of integers it takes the nearest."""
+    if has_torch_function_unary(images):
+        return handle_torch_function(sample_at, (images,), images, pixels)
     height, width = images.shape[2:]
     mode = "bilinear" if images.is_floating_point() else "nearest"
     least = torch.float32 if mode == "bilinear" else torch.float64  # which holds large integers

@@ -160,5 +160,9 @@ def direction_of(azimuth: Tensor) -> Tensor:
 
 
 def vector_of(theta: Tensor, direction: Tensor) -> Tensor:
-    """(..., 3): the unit vectors (x, y, z) of rays at θ in directions (cos φ, sin φ)."""
-    return torch.cat((torch.sin(theta)[..., None] * direction, torch.cos(theta)[..., None]), -1)
+    """(..., 3): the unit vectors (x, y, z) of rays at θ in directions (cos φ, sin φ); where θ is
+    NaN, NaN without a gradient."""
+    known = ~theta.isnan()[..., None]
+    angle = torch.where(known, theta[..., None], 0.0)  # NaN must not reach the gradients
+    rays = torch.cat((torch.sin(angle) * direction, torch.cos(angle)), -1)
+    return torch.where(known, rays, torch.nan)

@@ -6,6 +6,7 @@ from typing import Any, get_args
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.layers.linear import Linear
 from darswin.models.base import Model, init_by_width
@@ -78,13 +79,21 @@ class DistanceHead(PixelHead):
 
     def finish(self, logits: Tensor, shown: Tensor | None = None) -> Tensor:
         """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64; 0 unless shown."""
-        x = logits.to(torch.promote_types(logits.dtype, torch.float32))
-        x = LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT)
-        metres = self.typical_distance * torch.exp(x)
-        return metres if shown is None else torch.where(shown.to(x.device)[:, None], metres, 0.0)
+        metres = distances(logits, self.typical_distance)
+        return (
+            metres if shown is None else torch.where(shown.to(metres.device)[:, None], metres, 0.0)
+        )
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, typical_distance={self.typical_distance}"
+
+
+def distances(x: Tensor, typical: float) -> Tensor:
+    """The distances of a `DistanceHead`, in m, in float32 or float64."""
+    if has_torch_function_unary(x):
+        return handle_torch_function(distances, (x,), x, typical)
+    x = x.to(torch.promote_types(x.dtype, torch.float32))
+    return typical * torch.exp(LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT))
 
 
 class PixelModel(Model[Tensor]):

@@ -14,7 +14,8 @@ class Prepared(NamedTuple):
     - `view`: what its view needs; `view.shown`, (N or 1, H, W), is True for the pixels of the
       images that the view shows, and None if it shows all.
     - `rays`: `View.ray_channels`, if the network reads them.
-    - `tokens`: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
+    - `tokens`: for each map, a linear function of the positions of its tokens, which is added to
+      it, (N or 1, H', W', D).
     - `tables`: for each stage, the position biases of its blocks.
     - `remaps`: the `Remap` of each lens, by which detections come back; None without detections.
     """

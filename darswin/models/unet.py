@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.layers.transformer import Stage
+from darswin.lens import Lens
 from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Encoder
@@ -208,7 +209,7 @@ class Unet(PixelModel):
         maps = encoder.maps(x, prepared.tables)
         maps[-1] = encoder.norm(maps[-1])
         if self.places:
-            maps = self._with_places(maps, prepared.tokens)
+            maps = [x + place.to(x.dtype) for x, place in zip(maps, prepared.tokens, strict=True)]
         carried = head.carried(decoder(maps, prepared.tables[len(maps) :]))
         if self.view.in_pixels:
             carried = resized(carried.permute(0, 3, 1, 2), x.shape[2:])
@@ -219,11 +220,11 @@ class Unet(PixelModel):
             images = with_rays(self.view.floating(images, self.dtype), prepared.rays)
         return head.finish(head.refine(carried, images), prepared.view.shown)
 
-    def _with_places(self, maps: Sequence[Tensor], tokens: Sequence[Tensor]) -> list[Tensor]:
-        """The encoder's maps, plus a linear function of the positions of their tokens."""
-        weight = next(self.places.parameters())
-        steps = zip(maps, self.places, tokens, strict=True)
-        return [x + layer(place.to(weight)).to(x.dtype) for x, layer, place in steps]
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        prepared = super().prepare(lens, size)
+        layers: list[Any] = list(self.places)
+        steps = zip(layers, prepared.tokens, strict=True)
+        return prepared._replace(tokens=[layer(place.to(layer.weight)) for layer, place in steps])
 
 
 @register_model("darswin_unet_a", kind=Unet, variant="A", presets=_POLAR)

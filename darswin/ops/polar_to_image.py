@@ -4,6 +4,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_layout, check_pair, check_rising, check_tensor
@@ -63,6 +64,11 @@ def polar_to_image(
         ValueError: a shape, device or range does not fit, or the radii do not rise.
         NotImplementedError: forward-mode, torch.func or second derivatives are requested.
     """
+    if has_torch_function_unary(x):
+        return handle_torch_function(
+            polar_to_image, (x,), x, radii, center, size, affine=affine, points=points,
+            r_max=r_max, plan=plan, layout=layout,
+        )  # fmt: skip
     size = check_pair("size", size, lowest=0)
     check_layout(layout)
     r_max, tokens = _as_tensor(r_max, radii), layout == "tokens"

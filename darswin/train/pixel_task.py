@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, SumMetric
 
-from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan
 from darswin.train.task import Batch, TaskModule, finite_loss
+from darswin.utils.tasks import IGNORE
 from darswin.viz.pixels import Row, draw_predictions
 
 _SHOWN = 4  # samples in the figure of a test

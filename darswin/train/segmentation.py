@@ -8,13 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import some
 from darswin.ops.checks import tensor_there
 from darswin.train.pixel_metrics import BY_AREA, PixelSums, none_of_nan, or_one, ratio
 from darswin.train.pixel_task import PixelModule
 from darswin.train.scene_data import SceneData
 from darswin.utils.parameters import check, naming
+from darswin.utils.tasks import IGNORE
 
 LabelLoss = Literal["ce", "dice", "ce+dice"]
 

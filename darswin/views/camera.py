@@ -13,7 +13,7 @@ from darswin.lens.solve import vector_of
 from darswin.ops.checks import check_pair, readable
 from darswin.views.base import Pair, PerChannel
 from darswin.views.pixels import PixelView, check_supersampling
-from darswin.views.turn import STILL, Turn
+from darswin.views.turn import STILL, Turn, as_turn
 
 _MOST, _APART = 5, 1.5  # points along a pixel, and pixels of the picture between them
 _RADII = 4096  # entries of a table
@@ -36,6 +36,7 @@ class CameraView(PixelView):
         mean, std: the arguments of `View`.
 
     Raises:
+        TypeError: the lens is no `Lens`, or the turn no `Turn`.
         ValueError: the size is missing, or a number is out of range.
     """
 
@@ -51,10 +52,12 @@ class CameraView(PixelView):
         mean: PerChannel | None = 0.0,
         std: PerChannel | None = 1.0,
     ):
+        if not isinstance(lens, Lens):
+            raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
         size = picture_size(lens) if size is None else check_pair("size", size, 1)
         super().__init__(size, mean=mean, std=std)
         check_supersampling(supersampling)
-        self.lens, self.turn, self.supersampling = lens, turn, supersampling
+        self.lens, self.turn, self.supersampling = lens, as_turn(turn), supersampling
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         return vector_of(*self._seen(self._like(lens), points))
@@ -85,7 +88,8 @@ class CameraView(PixelView):
             return self.supersampling
         if not readable(lens.theta_max):
             raise ValueError("a graph does not know its lens: give a supersampling to CameraView")
-        return points_along((lens.r_max / self.lens.r_max.to(lens.theta_max)).max().item())
+        scales = lens.r_max / self.lens.r_max.to(lens.theta_max)
+        return points_along(max(scales.tolist(), default=0.0))
 
     def _seen(self, own: Lens, points: Tensor) -> tuple[Tensor, Tensor]:
         """θ, NaN where no ray lands, and (cos φ, sin φ) in the frame of the images."""
@@ -150,12 +154,16 @@ class CameraView(PixelView):
         return np.moveaxis(points, 0, -1)
 
     def _curves(self, own: Lens) -> tuple[float, np.ndarray, np.ndarray | None]:
-        """The radius of the last ray that both lenses see in the new picture; and at equally spaced
-        radii up to it, the radius in the old picture as a multiple, and θ if the old lens is not
-        radial: values and the steps between them, (2, K). Radii beyond lead outside."""
+        """The radius of the last ray in the new picture, up to its corners, that both lenses see;
+        and at equally spaced radii up to it, the radius in the old picture as a multiple, and θ if
+        the old lens is not radial: values and the steps between them, (2, K). Radii beyond lead
+        outside."""
         new_lens = self._like(own)
-        theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None]
-        theta = theta * torch.minimum(own.theta_max, new_lens.theta_max)
+        y, x = (np.array((-0.5, side - 0.5)) for side in self.size)
+        corners = np.hypot(*flat_points(self.lens, self.size, y, x, STILL.matrix))
+        in_corner = new_lens.unproject(corners.max().item())  # NaN beyond θ_max
+        last = torch.fmin(torch.minimum(own.theta_max, new_lens.theta_max), in_corner)
+        theta = torch.linspace(0, 1, _RADII, dtype=own.theta_max.dtype)[None] * last
         new, old = (lens.project(theta)[0].detach().numpy() for lens in (new_lens, own))
         radii = np.linspace(0, new[-1], _RADII)
         ratios = np.interp(radii, new, old)

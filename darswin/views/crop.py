@@ -8,12 +8,12 @@ from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.solve import direction_of
-from darswin.ops.checks import check_pair
+from darswin.ops.checks import as_int, check_pair
 from darswin.views.base import Pair, PerChannel
 from darswin.views.camera import centres, flat_points, picture_size, points_along
 from darswin.views.pixels import PixelView
 from darswin.views.remap import Remap
-from darswin.views.turn import STILL, Turn
+from darswin.views.turn import STILL, Turn, as_turn
 
 Part = tuple[int, int, int, int]  # top, left, height, width
 
@@ -30,11 +30,16 @@ class CropView(PixelView):
     areas of pixels. Pixels beyond θ_max stay in the picture, but have no label.
 
     Args:
-        part: top, left, height and width, px, in the turned picture, which keeps its size.
+        part: top, left, height and width, px, in the turned picture, which keeps its size. Beyond
+            the picture, the view is 0.
         size: (H', W') of the new picture. turn: about the optical axis.
         each_pixel: a rotated picture is read once for each pixel of the part. Otherwise it is read
             at up to 5 points along each new pixel.
         mean, std: the arguments of `View`.
+
+    Raises:
+        TypeError: the part is not four ints, the size not two, or the turn no `Turn`.
+        ValueError: a side is below 1.
     """
 
     size: Pair
@@ -50,7 +55,12 @@ class CropView(PixelView):
         std: PerChannel | None = 1.0,
     ):
         super().__init__(check_pair("size", size, 1), mean=mean, std=std)
-        self.part, self.turn, self.each_pixel = part, turn, each_pixel
+        ints = [side for value in part if (side := as_int(value)) is not None]
+        if len(ints) != 4 or len(part) != 4:
+            raise TypeError(f"part must be four ints, top, left, height and width, got {part}")
+        height, width = check_pair("height and width of the part", ints[2:], 1)
+        self.part: Part = (ints[0], ints[1], height, width)
+        self.turn, self.each_pixel = as_turn(turn), each_pixel
 
     def camera(self, lens: Lens, size: Pair) -> Lens:
         return self._turned(lens, size)[0].cropped(*self.part).resized(self.size)
@@ -63,11 +73,11 @@ class CropView(PixelView):
 
     def to_image(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         turns, moves = self._affine(lens, size, points)
-        return (points - moves) @ torch.linalg.inv(turns).mT
+        return torch.einsum("nij,n...j->n...i", torch.linalg.inv(turns), points - moves)
 
     def to_view(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         turns, moves = self._affine(lens, size, points)
-        return points @ turns.mT + moves
+        return torch.einsum("nij,n...j->n...i", turns, points) + moves
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         theta, direction = pixel_rays(self.camera(lens, size), self.size)
@@ -99,13 +109,12 @@ class CropView(PixelView):
         return zoom * moves + (zoom - 1) / 2 * [[0, 0, 1]]
 
     def _affine(self, lens: Lens, size: Pair, like: Tensor) -> tuple[Tensor, Tensor]:
-        """`_matrix` of N lenses for points (N, ..., 2): (N, …, 2, 2), and (N, …, 1, 2)."""
+        """`_matrix` of N lenses for points (N, ..., 2): (N, 2, 2), and (N, …, 2)."""
         # Without a rotation, it is the same for all lenses, and the graph may not know how many.
         each = [lens[k] for k in range(len(lens))] if self.turn.angle else [lens]
-        matrix = torch.from_numpy(np.stack([self._matrix(one, size) for one in each]))
-        shape = (len(each), *(1,) * max(like.dim() - 3, 0), 2, 3)
-        matrix = matrix.to(like.device, like.dtype).reshape(shape)
-        return matrix[..., :2], matrix[..., 2][..., None, :]
+        found = np.array([self._matrix(one, size) for one in each]).reshape(-1, 2, 3)
+        matrix = torch.from_numpy(found).to(like.device, like.dtype)
+        return matrix[..., :2], matrix[..., 2].reshape(len(each), *(1,) * (like.dim() - 2), 2)
 
     # -- of one lens ----------------------------------------------------------------------------
 
@@ -114,9 +123,12 @@ class CropView(PixelView):
 
         from darswin.utils.resize import area_resized
 
-        if self.turn.angle and not self.each_pixel:
-            return remap.sampled(picture)
         top, left, height, width = self.part
+        below, right = remap.size[0] - top - height, remap.size[1] - left - width
+        if not self.each_pixel if self.turn.angle else min(top, left, below, right) < 0:
+            return remap.sampled(picture)
+        if picture.dtype == np.float16:  # OpenCV has none
+            return self.picture(picture.astype(np.float32), remap).astype(picture.dtype)
         if self.turn.angle:
             whole = CropView(self.part, (height, width), self.turn)
             onto = whole._matrix(remap.some_lens, remap.size)

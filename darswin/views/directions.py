@@ -9,8 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map, pixel_grid, ray_channels
-from darswin.lens.solve import length_of
+from darswin.lens.pixels import as_map, ray_channels
 from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel, check_lens
@@ -159,13 +158,6 @@ class RayView(PixelView):
             return None
         around = self._layout(lens, size)[0][:, 0] * (self.size[1] + _SEAM) >= 2 * math.pi
         return around if not readable(around) or around.any() else None
-
-    def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
-        rays = self.to_rays(pixel_grid(self.size, lens.theta_max), lens, size)
-        aside = length_of(rays[..., :2])
-        theta = torch.atan2(aside, rays[..., 2])
-        shown = lens.sees(theta) & self._shows(rays)
-        return torch.where(shown, theta, torch.nan), rays[..., :2] / aside[..., None]
 
     def rays(self, lens: Lens, size: Pair) -> Tensor:
         """The rays of the pixels, unit vectors (N, H', W', 3) in the camera's frame; 0 where the

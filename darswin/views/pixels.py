@@ -1,6 +1,6 @@
 """The views that a network sees as pixels, and the way from their pixels back to the images."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, ray_channels, sample_at
+from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, check_pair, tensor_there
 from darswin.views.base import (
     Pair,
@@ -21,6 +22,7 @@ from darswin.views.base import (
     check_seen_images,
     in_full_precision,
 )
+from darswin.views.orientation import AXIS
 from darswin.views.remap import Remap
 from darswin.views.turn import STILL
 
@@ -29,7 +31,8 @@ _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a view is
 
 
 class PixelView(View):
-    """A view whose pixels are pixels of the images. A subclass says which, by rays or by points.
+    """A view whose pixels are pixels of the images. A subclass says which, by rays: `to_rays` and
+    `to_points`. If it knows a shorter way, it has `to_image`, `to_view` or `pixel_rays` too.
 
     Args:
         size: (H', W') of the view; None for the size of the images, if the view ignores its lens.
@@ -66,11 +69,13 @@ class PixelView(View):
     def to_image(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → pixels (N, ..., 2) of images of (H, W), also beyond
         their edges; NaN where the view shows nothing. `Remap` has this for arrays, in float64."""
-        return lens.project_points(self.to_rays(points, lens, size), size)
+        rays = self.to_rays(points, lens, size)
+        return _moved(rays, lambda known: lens.project_points(known, size))
 
     def to_view(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
         """The inverse of `to_image`: pixels (N, ..., 2), also beyond the edges of the view."""
-        return self.to_points(lens.unproject_points(points, size), lens, size)
+        rays = lens.unproject_points(points, size)
+        return _moved(rays, lambda known: self.to_points(known, lens, size))
 
     def image_points(self, lens: Any, size: Pair) -> Tensor | None:
         """The points of images of (H, W) at which the pixels of the view are read, k² for each,
@@ -83,7 +88,10 @@ class PixelView(View):
 
     def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
         """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
-        raise NotImplementedError
+        rays = self.to_rays(pixel_grid(self.size or size, lens.theta_max), lens, size)
+        aside = length_of(rays[..., :2])
+        theta = torch.atan2(aside, rays[..., 2])
+        return torch.where(lens.sees(theta), theta, torch.nan), rays[..., :2] / aside[..., None]
 
     def supersampling_of(self, lens: Any, size: Pair) -> int:
         """k, the points along each side of a pixel at which images of (H, W) are read."""
@@ -131,9 +139,9 @@ class PixelView(View):
         points = self.image_points(lens, size)
         if not back:
             return PreparedPixels(size, points)
-        places = self.shown_points(lens, size)
-        shown = None if places is None else places[..., 0] != OUTSIDE
-        return PreparedPixels(size, points, places, shown, self.goes_around(lens, size))
+        there = self.shown_points(lens, size)
+        shown = None if there is None else there[..., 0] != OUTSIDE
+        return PreparedPixels(size, points, there, shown, self.goes_around(lens, size))
 
     @in_full_precision
     def ray_channels(self, lens: Lens | None, size: Pair) -> Tensor:
@@ -210,6 +218,13 @@ class PixelView(View):
 
     def extra_repr(self) -> str:
         return f"size={self.size}"
+
+
+def _moved(rays: Tensor, move: Callable[[Tensor], Tensor]) -> Tensor:
+    """`move` of vectors (..., 3); NaN where they are, without NaN in the gradients of others."""
+    known = ~rays.isnan().any(-1, keepdim=True)
+    moved = move(torch.where(known, rays, tensor_there(AXIS, rays)))
+    return torch.where(known, moved, torch.nan)
 
 
 def check_supersampling(number: int | None) -> None:

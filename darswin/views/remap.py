@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +15,10 @@ from darswin.ops import _module
 from darswin.ops.checks import check_pair, per_channel, tensor_there
 from darswin.utils.arrays import as_tensor
 from darswin.utils.tasks import IGNORE
-from darswin.views.base import Pair, PerChannel, check_lens
+from darswin.views.base import Pair, PerChannel, check_images, check_lens
 
 if TYPE_CHECKING:
-    from darswin.frames.plans import Output, Plan, Sampler
+    from darswin.frames.plans import Plan, Sampler
 
 Points = TypeVar("Points", np.ndarray, Tensor)
 
@@ -82,7 +82,7 @@ class Remap:
 
     @cached_property
     def tiles(self) -> Sequence["Remap"]:
-        """The map of each picture that the view shows: itself, unless the view has tiles."""
+        """A map for each picture that the view shows. Without tiles, that is the map itself."""
         if self.view.count == 1:
             return [self]
         return [Remap(tile, self._given, self.size) for tile in self.view.tiles]
@@ -158,6 +158,8 @@ class Remap:
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):
             raise ValueError(f"points must have shape (..., 2), got {shape}")
+        if self.view.count > 1:
+            raise ValueError("points and boxes belong to one tile: use a map of `tiles`")
         if not isinstance(points, Tensor):
             given = np.asarray(points)
             moved = move(as_tensor(given, torch.float64)[None])[0]
@@ -181,16 +183,27 @@ class Remap:
         Returns:
             (H', W') or (H', W', C), of the picture's dtype, n tiles as (n, H', W', …); of a tensor
             the result of `view.see`, (B·n, C, H', W').
+
+        Raises:
+            TypeError: the picture is neither an array nor a tensor.
+            ValueError: it has another size.
         """
         if isinstance(picture, Tensor):
-            return self.view.see(picture, self._prepared)
+            images = check_images(picture)
+            self._check_size("picture", tuple(images.shape[2:]))
+            return self.view.see(images, self._prepared)
+        if not isinstance(picture, np.ndarray):
+            kind = type(picture).__name__
+            raise TypeError(f"the picture must be an array or a tensor, got {kind}")
         picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
-        self._check_size(picture)
+        self._check_size("picture", picture.shape[:2])
+        if not picture.size:  # no channels, which neither OpenCV nor torch takes
+            return self(np.zeros((*self.size, 1), picture.dtype))[..., :0]
         return self.view.picture(picture, self)
 
-    def _check_size(self, picture: np.ndarray) -> None:
-        if picture.shape[:2] != self.size:
-            raise ValueError(f"the picture must be (H, W) = {self.size}, got {picture.shape[:2]}")
+    def _check_size(self, name: str, shape: tuple[int, ...]) -> None:
+        if shape != self.size:
+            raise ValueError(f"the {name} must be (H, W) = {self.size}, got {shape}")
 
     def sampled(self, picture: np.ndarray) -> np.ndarray:
         """`remap(picture)` by points: compiled for uint8 and float32, else through torch."""
@@ -210,7 +223,7 @@ class Remap:
         return seen.reshape(*tiles, *self.view_size, *picture.shape[2:])
 
     def sampler(
-        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
+        self, output: Literal["uint8", "image"] = "uint8", *, mean: PerChannel | None = None,
         std: PerChannel | None = None,
     ) -> "Sampler":  # fmt: skip
         """A `darswin.frames.Sampler` of the camera's frames; arguments: see `plan`."""
@@ -219,7 +232,7 @@ class Remap:
         return Sampler(self.plan(output, mean=mean, std=std))
 
     def plan(
-        self, output: "Output" = "uint8", *, mean: PerChannel | None = None,
+        self, output: Literal["uint8", "image"] = "uint8", *, mean: PerChannel | None = None,
         std: PerChannel | None = None,
     ) -> "Plan":  # fmt: skip
         """The points at which the camera's frames are read, for `darswin.frames.Sampler`.
@@ -264,16 +277,22 @@ class Remap:
             target: (H, W), of the picture.
 
         Returns:
-            (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where
-            the view shows nothing.
+            (H', W'), n tiles as (n, H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and
+            0 in others, where the view shows nothing.
+
+        Raises:
+            ValueError: the target has another shape.
         """
-        self._check_size(target)
+        self._check_size("target", target.shape)
+        if self.view.count > 1:
+            return np.stack([tile.target(target) for tile in self.tiles])
         x, y = np.moveaxis(np.rint(self._target_points), -1, 0)
         height, width = self.size
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         target = np.asarray(target, target.dtype.newbyteorder("="))
         index = np.where(inside, y * width + x, 0).astype(np.intp)
-        return np.where(inside, target.ravel()[index], IGNORE if target.dtype == np.uint8 else 0)
+        missing = target.dtype.type(IGNORE if target.dtype == np.uint8 else 0)
+        return np.where(inside, target.ravel()[index], missing)
 
     @cached_property
     def _target_points(self) -> np.ndarray:
@@ -289,10 +308,16 @@ class Remap:
 
         Returns:
             (B, K, H, W), or an array (K, H, W).
+
+        Raises:
+            ValueError: the maps have another number of dimensions.
         """
+        form, least = ("(B, K, h, w)", 4) if isinstance(maps, Tensor) else ("(K, h, w)", 3)
+        if not least <= len(maps.shape) <= 4:
+            raise ValueError(f"maps must have shape {form}, got {tuple(maps.shape)}")
         if isinstance(maps, Tensor):
             return self.view.back(maps, self._prepared)
-        planes = torch.from_numpy(maps.reshape(-1, *maps.shape[-3:]))
+        planes = as_tensor(maps.reshape(self.view.count, *maps.shape[-3:]))
         return self.view.back(planes, self._prepared)[0].numpy()
 
     @property

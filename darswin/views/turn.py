@@ -22,3 +22,10 @@ class Turn(NamedTuple):
 
 
 STILL = Turn()
+
+
+def as_turn(turn: object) -> Turn:
+    """The turn, checked; TypeError for others."""
+    if not isinstance(turn, Turn):
+        raise TypeError(f"turn must be a darswin.views.Turn, got {turn!r}")
+    return turn

@@ -334,13 +334,19 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        ("--network n.onnx --view fish", r"view must be one of .*'mercator'.* got 'fish'"),
+        ("--network n.onnx --view fish", r"--view must be one of .*, mercator, .* got fish"),
         ("--network n.onnx --view polar", "--view polar shows no picture to a network"),
-        ("--network n.onnx --view mercator:3", "'mercator' has no such option: .*'count'"),
+        (
+            "--network n.onnx --view mercator:3",
+            "'mercator' has no option 'count'; it has fov,",
+        ),
         ("--network n.onnx --view tiles:x", r"--view must be NAME or NAME:COUNT, .* got tiles:x"),
         ("--network n.onnx --view tiles:3", "count must be from 4 to 9, got 3"),
-        ("--network n.onnx --view none --fov_deg 90", "'none' has no such option: .*'fov'"),
-        ("--network n.onnx --view none --up 0,0,1", "'none' has no such option: .*'up'"),
+        (
+            "--network n.onnx --view none --fov_deg 90",
+            "'none' has no option 'fov'",
+        ),
+        ("--network n.onnx --view none --up 0,0,1", "'none' has no option 'up'"),
         ("--network n.onnx --fov_deg 0", "--fov_deg must be above 0° and at most 360° for a"),
         (
             "--network n.onnx --view perspective --fov_deg 180",

@@ -367,7 +367,7 @@ def edited(flat, folder, edit):
         (FLAT, ("--lens", FLAT), "needs the image_size"),
         ("tiles:x", ("--lens", FLAT), "--to must be NAME or NAME:COUNT, such as tiles:5"),
         ("tiles:3", ("--lens", FLAT), "count must be from 4 to 9"),
-        ("mercator:2", ("--lens", FLAT), "has no such option"),
+        ("mercator:2", ("--lens", FLAT), "has no option 'count'"),
         ("polar", ("--lens", FLAT), "shows no picture"),
         ("none", ("--lens", FLAT), "--to none shows the picture as it is"),
         (WIDE, ("--lens", FLAT, "--up", "0,1,0"), "--up must be left out unless --to is a view"),

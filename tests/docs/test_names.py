@@ -1,7 +1,8 @@
-"""Names in code font on the page of lenses exist, and files on the page for contributors."""
+"""Names in code font on the pages exist, and files on the page for contributors."""
 
 import re
 from pathlib import Path
+from pydoc import locate
 
 from darswin import lens
 
@@ -21,6 +22,15 @@ def test_every_name_on_the_page_of_lenses_exists():
     names = {match[1] for match in found if match} - {"darswin"}
     assert len(names) > 40 and not names - known - THEIRS
     assert names >= THEIRS  # remove what the page no longer has
+
+
+def test_every_name_in_darswin_on_the_pages_exists():
+    root, found = PAGE.parents[1], set()
+    for page in (root / "README.md", *(root / "docs").rglob("*.md")):
+        text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)  # blocks are run
+        found |= set(re.findall(r"`(darswin(?:\.\w+)+)[`(]", text))
+    assert len(found) > 30
+    assert not [name for name in sorted(found) if locate(name) is None]
 
 
 def test_every_file_on_the_page_for_contributors_exists():

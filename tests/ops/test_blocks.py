@@ -10,7 +10,7 @@ from torch import nn
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import Own, OwnBlocks
-from darswin.deploy.program import BLOCK, RUN
+from darswin.deploy.program import BLOCK, RUN, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
@@ -207,7 +207,7 @@ def test_wrong_arguments():
 
 
 def test_blocks_that_do_not_fit():
-    blocks = OwnBlocks(stage(depth=1))
+    blocks = OwnBlocks(stage(depth=1), Weights())
     table, x = torch.zeros(1, *blocks.table_shapes[0]), torch.zeros(1, *blocks.map_shape)
     blocks(x, [table])
     words, weights = blocks.words, blocks.weights.words

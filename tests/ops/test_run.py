@@ -7,7 +7,7 @@ import torch
 from helpers import network
 
 from darswin import optimize
-from darswin.deploy.forward import frame_program
+from darswin.deploy.networks import frame_program
 from darswin.deploy.program import Program, Weights
 from darswin.lens import Spherical
 
@@ -21,7 +21,7 @@ def given(name="darswin_a_nano", **options):
     lens = Spherical.from_fov(0.5, math.radians(160), size[0] / 2)
     fast = optimize(model, lens=lens)
     prepared = fast.prepare(None, size)
-    found = frame_program(fast, prepared)
+    found = frame_program(optimize(model), lens, size)
     images = torch.randn(1, 3, *size)
     inputs = [fast.sample(images, prepared)]
     inputs += [images.permute(0, 2, 3, 1)] * found.reads_frame
@@ -85,7 +85,7 @@ def test_numbers_that_are_copied_and_changed():
     program = Program(Weights())
     x = program.input(2, 6, 4)
     program.output(program.permuted(x, (2, 3, 2, 4), (1, 0, 3, 2), 3, 2, 8))
-    program.output(program.channels_first(x))
+    program.output(program.permuted(x, x.shape, (2, 0, 1), 4, 2, 6))
     program.output(program.mean(x))
     program.output(program.resized(x, (5, 3)))
     numbers = torch.randn(2, 2, 6, 4)

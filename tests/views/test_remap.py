@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from darswin import boxes as of_boxes
 from darswin.data.labels.labels import Thing, move_things
 from darswin.frames import Sampler
-from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Spherical
+from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Perspective, Spherical
 from darswin.models import LensAdapter
 from darswin.views import CameraView, CropView, Turn, list_views, make_view
 
 SIZE = (90, 120)
 LENSES = {
-    "circle": Equidistant(36.0, 1.2, center=[57.0, 46.0], image_size=SIZE),
+    "circle": Equidistant(23.0, 1.9, center=[57.0, 46.0], image_size=SIZE),
     "cut": KannalaBrandt(60.0, [0.01, -0.004], 1.5, center=[61.0, 43.0], image_size=SIZE),
     "oblong": Spherical(0.7, 60.0, 1.4, [58.0, 45.0], affine=[[1, 0.04], [0, 0.85]],
                         image_size=SIZE),
@@ -36,6 +36,7 @@ def view_of(name, size=(40, 40), **options):
     own = {
         "camera": lambda: CameraView(OTHER, turn=Turn(0.4, True), **options),
         "camera of another kind": lambda: CameraView(SHEARED, **options),
+        "camera up to 90°": lambda: CameraView(Perspective(25.0, image_size=(50, 60)), **options),
         "crop": lambda: CropView((10, 20, 71, 83), (34, 45)),
         "turned crop": lambda: CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
         "none": lambda: make_view("none", SIZE),
@@ -46,14 +47,16 @@ def view_of(name, size=(40, 40), **options):
 
 
 VIEWS = [*sorted(set(list_views()) - {"polar"}), "camera", "camera of another kind", "crop",
-         "turned crop"]  # fmt: skip
+         "camera up to 90°", "turned crop"]  # fmt: skip
 pairs = pytest.mark.parametrize(("name", "kind"), product(VIEWS, LENSES))
 
 
-def by_loops(remap, reads=1):
+def by_loops(remap, supersampling=1):
     """The points of the picture that the pixels of a view show, (k·H', k·W', 2), from rays."""
     height, width = remap.view_size
-    y, x = ((np.arange(side * reads) + 0.5) / reads - 0.5 for side in (height, width))
+    y, x = (
+        (np.arange(side * supersampling) + 0.5) / supersampling - 0.5 for side in (height, width)
+    )
     grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
     if isinstance(remap.view, CropView) or not remap.view.uses_lens:
         return remap.view.to_image(grid, remap.lens, remap.size)[0].numpy()
@@ -95,6 +98,14 @@ def test_points_and_their_inverse(name, kind):
         assert known.mean() > 0.98 or not inside.any()
         as_tensors = remap.to_image(torch.from_numpy(pixels))
         np.testing.assert_array_equal(as_tensors.numpy(), found)
+        for move in (remap.to_image, remap.to_view, remap.rays):
+            one, all_of_them = move(pixels[20, 15]), move(pixels)
+            np.testing.assert_allclose(one, all_of_them[20, 15], rtol=0, atol=1e-9)
+            ends = torch.tensor([[12.0, 11], [500, 500]], requires_grad=True)
+            moved = move(ends)
+            torch.nan_to_num(moved).sum().backward()
+            assert ends.grad.isfinite().all()
+            assert (ends.grad.any(-1) != moved.isnan().any(-1)).all()
 
 
 @pairs
@@ -206,6 +217,38 @@ def test_one_box_has_one_answer(name, kind):
     assert thing.visible == pytest.approx(visible[0], abs=1e-3)
 
 
+@pytest.mark.parametrize("name", [*VIEWS, "none"])
+def test_arrays_of_any_type_order_and_number_of_channels(name):
+    remap = view_of(name).at(LENSES["oblong"], SIZE)
+    count = (remap.view.count,) if remap.view.count > 1 else ()
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 200, (*SIZE, 9)).astype(np.float64)
+    expected = remap(picture[..., :1])[..., 0]
+    for dtype in ("u1", "u2", "f2", "f4", "f8", ">u2", ">f4", ">f8"):
+        for channels in (0, 1, 2, 5, 9):
+            given = picture[..., :channels].astype(dtype)[::-1, ::-1].copy()[::-1, ::-1]
+            found = remap(given)
+            assert found.dtype == given.dtype.newbyteorder("=")
+            assert found.shape == (*count, *remap.view_size, channels)
+            if channels:
+                atol = 0.02 if dtype[-1] in "48" else 1.01
+                np.testing.assert_allclose(found[..., 0], expected, rtol=0, atol=atol)
+    maps = rng.integers(0, 9, (*count, 3, *remap.view_size))
+    for dtype in ("u1", "i8", "f2", "f4", ">u2", ">f4", "?"):
+        given = maps.astype(dtype)
+        back = remap.back(given[..., ::-1].copy()[..., ::-1])
+        assert back.dtype == given.dtype.newbyteorder("=") and back.shape == (3, *SIZE)
+        tensors = torch.from_numpy(given.astype(back.dtype).reshape(-1, 3, *remap.view_size))
+        np.testing.assert_array_equal(back, remap.back(tensors)[0])
+        assert remap.back(given[..., :0, :, :]).shape == (0, *SIZE)
+        labels = picture[..., 0].astype(dtype)
+        found = remap.target(labels)
+        assert found.dtype == labels.dtype.newbyteorder("=")
+        tiles = [tile.target(labels.astype(found.dtype)) for tile in remap.tiles]
+        np.testing.assert_array_equal(found, np.reshape(tiles, found.shape))
+        assert found.shape == (*count, *remap.view_size)
+
+
 @pytest.mark.parametrize("name", sorted(set(list_views()) - {"polar", "none"}))
 @given(st.data())
 def test_any_sizes_from_one_pixel_up(name, data):
@@ -230,6 +273,17 @@ def test_any_sizes_from_one_pixel_up(name, data):
     assert remap.back(np.ones((view_count(remap), 2, *shape), np.float32)).shape == (2, *size)
 
 
+@pytest.mark.parametrize("name", VIEWS)
+def test_no_pictures_of_no_lenses(name):
+    view, lens = view_of(name), LENSES["oblong"]
+    for lenses in (lens, lens[:0]):
+        assert view(torch.zeros(0, 3, *SIZE), lenses).shape == (
+            0,
+            3,
+            *view.at(lens, SIZE).view_size,
+        )
+
+
 def view_count(remap):
     return len(remap.tiles)
 
@@ -241,12 +295,62 @@ def test_a_remap_is_of_one_lens_and_one_size():
     with pytest.raises(TypeError, match=r"lens must be a darswin.lens.Lens, got NoneType"):
         view.at(None, SIZE)
     remap = view.at(LENSES["cut"], SIZE)
-    with pytest.raises(ValueError, match=r"the picture must be \(H, W\) = \(90, 120\)"):
-        remap(np.zeros((9, 9), np.uint8))
+    for picture, kind, message in (
+        (np.zeros((9, 9), np.uint8), ValueError, r"the picture must be \(H, W\) = \(90, 120\)"),
+        (torch.zeros(1, 3, 9, 9), ValueError, r"picture must be .*, got \(9, 9\)"),
+        (torch.zeros(3, *SIZE), ValueError, r"shape \(B, C, H, W\), .* pass images\[None\]"),
+        ([[1, 2]], TypeError, "the picture must be an array or a tensor, got list"),
+    ):
+        with pytest.raises(kind, match=message):
+            remap(picture)
+    with pytest.raises(ValueError, match=r"target must be .*, got \(90, 120, 3\)"):
+        remap.target(np.zeros((*SIZE, 3), np.uint8))
+    for maps, form in (
+        (np.zeros((8, 8)), r"\(K, h, w\)"),
+        (torch.zeros(1, 8, 8), r"\(B, K, h, w\)"),
+    ):
+        with pytest.raises(ValueError, match=f"maps must have shape {form}, got"):
+            remap.back(maps)
+    with pytest.raises(ValueError, match="belong to one tile"):
+        make_view("tiles", (8, 8)).at(LENSES["cut"], SIZE).boxes_to_view(np.ones((1, 4)))
     with pytest.raises(TypeError, match="rays need the lens"):
         make_view("none", None).at(None, SIZE).rays(np.zeros((1, 2)))
     with pytest.raises(ValueError, match="mean and the std"):
         make_view("mercator", (8, 8), mean=None, std=None).at(LENSES["cut"], SIZE).plan("image")
+
+
+def test_frames_with_the_channels_last_are_seen_as_those_with_the_channels_first():
+    remap = make_view("mercator", (8, 8)).at(LENSES["cut"], SIZE)
+    frames = torch.randint(256, (2, *SIZE, 3), dtype=torch.uint8)
+    torch.testing.assert_close(remap(frames), remap(frames.permute(0, 3, 1, 2)))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_crop_beyond_the_picture_is_padded(mirrored):
+    picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
+    for part in ((-7, 20, 60, 50), (50, -11, 40, 140), (60, 100, 50, 50)):
+        crop = CropView(part, part[2:], Turn(mirrored=mirrored))
+        turned = picture[:, ::-1] if mirrored else picture
+        padded = np.pad(turned, ((50, 50), (50, 50), (0, 0)))
+        top, left, height, width = part[0] + 50, part[1] + 50, *part[2:]
+        wanted = padded[top : top + height, left : left + width]
+        np.testing.assert_array_equal(crop.at(LENSES["cut"], SIZE)(picture), wanted)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "message"),
+    [
+        (lambda: CropView((0, 0, 9), (5, 5)), TypeError, r"four ints, .*, got \(0, 0, 9\)"),
+        (lambda: CropView((0.5, 0, 9, 9), (5, 5)), TypeError, "four ints"),
+        (lambda: CropView((0, 0, -9, 9), (5, 5)), ValueError, "height and width of the part"),
+        (lambda: CropView((0, 0, 9, 9), (5, 5), 0.3), TypeError, "turn must be .*Turn, got 0.3"),
+        (lambda: CameraView(OTHER, turn=0.3), TypeError, "turn must be .*Turn, got 0.3"),
+        (lambda: CameraView("front.json"), TypeError, "lens must be a .*Lens, got str"),
+    ],
+)
+def test_wrong_parts_turns_and_lenses_are_refused(make, kind, message):
+    with pytest.raises(kind, match=message):
+        make()
 
 
 def test_a_plan_normalizes_as_the_view_says():

@@ -265,7 +265,7 @@ def test_a_map_coarser_than_the_image_is_resized():
     model = network("swin_unet_nano", image_size=(128, 64), patch_size=8, skip_width=0)
     images, prepared = torch.randn(2, 3, 128, 64), model.prepare(None, (128, 64))
     maps = model.encoder.forward_intermediates(images, norm=True, intermediates_only=True)
-    maps = model._with_places(maps, prepared.tokens)
+    maps = [x + place for x, place in zip(maps, prepared.tokens, strict=True)]
     x = model.segmentation_head.proj(model.decoder(maps, prepared.tables[3:]))
     assert x.shape == (2, 64, 32, 5)
     expected = F.interpolate(x.permute(0, 3, 1, 2), (128, 64), mode="bilinear")

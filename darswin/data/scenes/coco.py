@@ -22,9 +22,9 @@ import numpy as np
 
 from darswin.data.scenes.files import Options, pair, pictures_in, stem_of, stems
 from darswin.data.scenes.scene import Scenes, as_classes
-from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import SPLITS, Split, some
 from darswin.utils.image import decoded, file_content
+from darswin.utils.tasks import IGNORE
 from darswin.utils.text import read_json
 
 COLORS = 1 << 24

@@ -9,7 +9,7 @@ from typing import Literal
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below, warn_of_unread
 from darswin.data.scenes.scene import Classes, read_label_map, read_palette
-from darswin.data.scenes.targets import IGNORE, Target
+from darswin.data.scenes.targets import Target
 from darswin.data.splits import (
     Split,
     part_of_split,
@@ -20,6 +20,7 @@ from darswin.data.splits import (
     warn_left_out,
 )
 from darswin.utils.parameters import naming
+from darswin.utils.tasks import IGNORE
 
 Pairs = dict[str, tuple[str, str]]  # stem: (picture, target), relative to a folder
 ScenesSplit = Literal["train", "val", "test", "all"]

@@ -1,0 +1,171 @@
+"""The rules by which functions become instructions: see record.py."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.deploy.own import OwnLinear, OwnNorm
+from darswin.deploy.packed import OwnBlocks
+from darswin.deploy.program import NoProgramError
+from darswin.deploy.record import Recorded, inverse, lowers
+from darswin.lens.pixels import OUTSIDE, sample_at
+from darswin.models.pixel import distances
+from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
+
+# -- layers of our own ---------------------------------------------------------------------------
+
+
+@lowers(OwnLinear.__call__)
+def _(layer: OwnLinear, x: Recorded) -> Recorded:
+    return x.writer.by_rows(x, layer.columns, lambda rows: x.writer.program.linear(rows, layer))
+
+
+@lowers(OwnNorm.__call__)
+def _(norm: OwnNorm, x: Recorded) -> Recorded:
+    return x.writer.by_rows(x, x.shape[-1], lambda rows: x.writer.program.norm(rows, norm))
+
+
+@lowers(OwnBlocks.__call__)
+def _(blocks: OwnBlocks, x: Recorded, tables: Sequence[Tensor]) -> Recorded:
+    trace, inputs = x.writer, [x.writer.of(table).slot for table in tables]
+    return trace.filled(trace.program.blocks(trace.dense(x), blocks, inputs))  # type: ignore[arg-type]
+
+
+# -- functions between them ----------------------------------------------------------------------
+
+
+@lowers(Tensor.device.__get__)
+def _(x: Recorded) -> torch.device:
+    return torch.device("cpu")  # where tensors of the lens are
+
+
+@lowers(Tensor.to, Tensor.float)
+def _(x: Tensor, *_: Any, **__: Any) -> Tensor:
+    return x if isinstance(x, Recorded) else x.float()
+
+
+@lowers(Tensor.contiguous)
+def _(x: Recorded, memory_format: torch.memory_format = torch.contiguous_format) -> Recorded:
+    if memory_format != torch.contiguous_format or x.meta.is_contiguous():
+        return x
+    return x.writer.copy_of(x, x.meta)
+
+
+@lowers(Tensor.mean)
+def _(x: Recorded, dim: int | Sequence[int]) -> Recorded:
+    if dim != (*range(1, x.dim() - 1),):
+        raise NoProgramError(f"a mean over the axes {dim} is no instruction")
+    return x.writer.filled(x.writer.program.mean(x.writer.dense(x)))
+
+
+@lowers(torch.add, Tensor.add, Tensor.__add__, Tensor.__radd__)
+def _(x: Tensor, y: Tensor) -> Recorded:
+    trace = next(value.writer for value in (x, y) if isinstance(value, Recorded))
+    if not (isinstance(x, Tensor) and isinstance(y, Tensor) and x.shape == y.shape):
+        raise NoProgramError("a sum of values of other shapes is no instruction")
+    one, other = trace.of(x), trace.of(y)
+    order = one.made().order()
+    total = trace.program.added(trace.dense(one, order), trace.dense(other, order))
+    return trace.filled(total, inverse(order))
+
+
+@lowers(F.gelu)
+def _(x: Recorded) -> Recorded:
+    order = x.made().order()
+    return x.writer.filled(x.writer.program.gelu(x.writer.dense(x, order)), inverse(order))
+
+
+@lowers(distances)
+def _(x: Recorded, typical: float) -> Recorded:
+    order = x.made().order()
+    found = x.writer.program.distance(x.writer.dense(x, order), typical)
+    return x.writer.filled(found, inverse(order))
+
+
+@lowers(torch.cat)
+def _(tensors: Sequence[Tensor], dim: int = 0) -> Recorded:
+    trace = next(value.writer for value in tensors if isinstance(value, Recorded))
+    parts = [trace.of(value) for value in tensors]
+    first, dim = parts[0], dim % parts[0].dim()
+    # Convolutions read maps with the channels last.
+    order = [0, 2, 3, 1] if first.dim() == 4 and dim == 1 else first.made().order()
+    sizes = list(first.shape)
+    sizes[dim] = sum(part.shape[dim] for part in parts)
+    whole = trace.filled(trace.program.buffer(*(sizes[axis] for axis in order[1:])), inverse(order))
+    begin = 0
+    for part in parts:
+        place = trace.view(whole, whole.meta.narrow(dim, begin, part.shape[dim]))
+        begin += part.shape[dim]
+        if part.slot is None and (there := _viewed(place, part.source.shape)) is not None:
+            part, place = part.source, there
+        part.made()
+        assert part.slot is not None
+        trace.move(part.slot, part.meta, place)
+    return whole
+
+
+def _viewed(place: Recorded, shape: Sequence[int]) -> Recorded | None:
+    """A view in another shape, or None if its strides have none."""
+    try:
+        meta = place.meta.view(shape)
+    except RuntimeError:
+        return None
+    return place.writer.view(place, meta)
+
+
+@lowers(torch.where)
+def _(condition: Tensor, x: Recorded, other: float) -> Recorded:
+    """Pixels (1, K, H, W) where the condition (1, 1, H, W) is true, else 0."""
+    if isinstance(condition, Recorded) or other != 0.0:
+        raise NoProgramError("a choice between values is no instruction")
+    if condition.all():
+        return x
+    rows, columns = (torch.arange(side) for side in condition.shape[2:])
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
+    return sample_at(x, torch.where(condition[:, 0, :, :, None], pixels, OUTSIDE))  # type: ignore[return-value]
+
+
+# -- maps and pixels -----------------------------------------------------------------------------
+
+_LAST, _FIRST = (0, 2, 3, 1), (0, 3, 1, 2)  # (1, C, H, W) as (1, H, W, C), and back
+
+
+@lowers(torch.conv2d)
+def _(x, weight, bias=None, stride=1, padding=0, dilation=1, groups=1) -> Recorded:
+    size = tuple(weight.shape[2:])
+    if (size, stride, padding, dilation, groups) != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
+        raise NoProgramError(f"this convolution of {size[0]} × {size[1]} is no instruction")
+    return x.writer.filled(x.writer.program.conv(x.writer.dense(x, _LAST), weight, bias), _FIRST)
+
+
+@lowers(F.interpolate)
+def _(x: Recorded, size: Any, mode: str, align_corners: bool | None, **others: Any) -> Recorded:
+    if mode != "bilinear" or align_corners or any(others.values()):
+        raise NoProgramError(f"this interpolation, {mode}, is no instruction")
+    return x.writer.filled(x.writer.program.resized(x.writer.dense(x, _LAST), tuple(size)), _FIRST)
+
+
+@lowers(sample_at)
+def _(images: Recorded, pixels: Tensor) -> Recorded:
+    trace = images.writer
+    points = trace.of(pixels.float()).slot
+    assert points is not None
+    return trace.filled(trace.program.sampled(trace.dense(images, _LAST), points), _FIRST)
+
+
+@lowers(polar_to_image)
+def _(x, radii, center, size, *, affine, points, r_max, plan, layout) -> Recorded:
+    if plan is None:
+        like = radii.new_empty((1, *x.shape[1:3], 0))
+        plan = polar_to_image_plan(
+            like, radii, center, size, affine=affine, points=points, r_max=r_max
+        )
+    if layout != "tokens" or plan is None:
+        raise NoProgramError("polar_to_image without a plan is no instruction")
+    trace = x.writer
+    there = trace.of(plan).slot
+    assert there is not None
+    return trace.filled(trace.program.to_image(trace.dense(x), there))
