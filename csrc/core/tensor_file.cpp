@@ -2,7 +2,6 @@
 
 #include <fcntl.h>
 #include <sys/mman.h>
-#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -40,11 +39,11 @@ std::shared_ptr<const char> content_of(const std::string& path, int64_t& size) {
   };
   // Without O_NONBLOCK, a pipe would wait for its other end.
   const File file{open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK)};
-  struct stat facts;
-  if (file.descriptor < 0 || fstat(file.descriptor, &facts) != 0) fail(errno);
-  if (S_ISDIR(facts.st_mode)) fail(EISDIR);
-  require(S_ISREG(facts.st_mode), "it is a pipe, a socket or a device");
-  size = facts.st_size;
+  if (file.descriptor < 0) fail(errno);
+  size = lseek(file.descriptor, 0, SEEK_END);
+  require(size >= 0, "it is a pipe, a socket or a device");
+  char first;
+  if (pread(file.descriptor, &first, 1, 0) < 0) fail(errno);  // it is a folder
   require(size > kLength && size <= kMostBytes, "it is too short or too long");
   void* all = mmap(nullptr, size, PROT_READ, MAP_PRIVATE, file.descriptor, 0);
   const bool is_mapped = all != MAP_FAILED;
