@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-numerics test-all test-lowest test-isa test-asan test-tsan test-clang fuzz kills lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-numerics test-all test-lowest test-isa sanitized test-asan test-tsan test-clang fuzz kills lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -78,16 +78,19 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 # there. Python itself is not sanitized, so the sanitizers' libraries must be loaded first.
 SANITIZED := build/sanitized
 PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=libstdc++.so)
+SANITIZER = LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
+	    UBSAN_OPTIONS=print_stacktrace=1
 
-test-asan: build  ## test the operators on every tier with AddressSanitizer and UBSan
+sanitized: build
 	@rm -rf $(SANITIZED)/darswin
 	@PATH=$(ROOT)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined DARSWIN_BUILD=cmake-sanitized \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
+
+test-asan: sanitized  ## test the operators on every tier with AddressSanitizer and UBSan
 	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
 	cd $(SANITIZED); for tier in $$tiers; do \
 	  echo "== $$tier, sanitized"; \
-	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
-	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
+	  $(SANITIZER) ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
 	      -m "not unsanitized" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py; \
 	done
@@ -106,9 +109,11 @@ test-clang: build  ## test the operators and frames as clang compiles them; CLAN
 	@cd $(CLANG); DARSWIN_BUILD=cmake-clang $(PYTEST) -q -c $(ROOT)/pyproject.toml \
 	  --rootdir $(ROOT) -m "not slow" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/test_build.py
 
-fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
-	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
-	  tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
+FUZZ := $(ROOT)/$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz
+fuzz: sanitized  ## call the operators with hostile arguments, read 100,000 wrong calibrations and 250,000 wrong files of cameras (45 minutes)
+	$(FUZZ) tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
+	cd $(SANITIZED); $(SANITIZER) $(FUZZ) -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
+	  $(ROOT)/tests/test_frame_files.py
 
 kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py

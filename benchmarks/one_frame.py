@@ -215,7 +215,8 @@ def camera_of(name: str, folder: Path) -> Camera:
     model, camera = model_of(name, MODELS[name][0]), lens.load(EXAMPLES / "front.json")
     frame = cv2.imread(str(EXAMPLES / "front.jpg"))[..., ::-1].copy()
     network, plan, graph = (
-        str(folder / f"{name}.{kind}") for kind in ("network.npz", "plan.npz", "tokens.onnx")
+        str(folder / f"{name}.{kind}")
+        for kind in ("network.safetensors", "plan.safetensors", "tokens.onnx")
     )
     size = frame.shape[:2]
     export_network(model, camera, size, network)

@@ -1,6 +1,6 @@
 """Classifies the frames of a video without torch, and prints the classes and the speed.
 
-    python examples/camera.py VIDEO [--network camera.npz] [--threads N] [--every N]
+    python examples/camera.py VIDEO [--network camera.safetensors] [--threads N] [--every N]
 
 Only NumPy, OpenCV and darswin.frames run here. The file is made once, where torch is installed. The
 frames of the video must have its size:
@@ -9,11 +9,11 @@ frames of the video must have its size:
 
     model, card = darswin.models.load_model("runs/camera/checkpoints/best.safetensors")
     lens = darswin.lens.load("calibration.json")
-    export_network(model, lens, (1080, 1920), "camera.npz")
+    export_network(model, lens, (1080, 1920), "camera.safetensors")
 
-ONNX Runtime can run the network instead: `--graph camera.onnx --plan plan.npz`, with these files:
+ONNX Runtime can run the network instead: `--graph camera.onnx --plan plan.safetensors`. The files:
 
-    plan(model, lens, (1080, 1920)).save("plan.npz")
+    plan(model, lens, (1080, 1920)).save("plan.safetensors")
     images = torch.zeros(1, 3, 1080, 1920, dtype=torch.uint8)
     export_onnx(model, "camera.onnx", images, lens, fixed_lens=True, input="tokens")
 """
@@ -83,9 +83,9 @@ def frames_of(path: str, gray: bool) -> Iterator[np.ndarray]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("video", help="a video file")
-    parser.add_argument("--network", default="camera.npz", help="a file of export_network")
+    parser.add_argument("--network", default="camera.safetensors", help="a file of export_network")
     parser.add_argument("--graph", help="a file of `export_onnx`, for ONNX Runtime")
-    parser.add_argument("--plan", default="plan.npz", help="with a graph: its plan")
+    parser.add_argument("--plan", default="plan.safetensors", help="with a graph: its plan")
     parser.add_argument("--threads", type=int, default=1, help="the most threads to use")
     parser.add_argument("--every", type=int, default=30, help="print every N-th frame's class")
     args = parser.parse_args()

@@ -1,7 +1,13 @@
-"""Random frames for tests of darswin.frames, and their bilinear samples by NumPy."""
+"""Random frames and small networks for tests of darswin.frames, and bilinear samples by NumPy."""
+
+from pathlib import Path
 
 import numpy as np
+import torch
+from torch import nn
 
+from darswin import create_model, frames
+from darswin.deploy import camera
 from darswin.lens import Equidistant
 
 MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
@@ -41,3 +47,28 @@ def bilinear(image, x, y):
     top = padded[row, column] * (1 - right) + padded[row, column + 1] * right
     bottom = padded[row + 1, column] * (1 - right) + padded[row + 1, column + 1] * right
     return top * (1 - lower) + bottom * lower
+
+
+def model_of(family="darswin_a", channels=3, **options):
+    """A small model whose signal neither grows nor dies."""
+    torch.manual_seed(0)
+    if family.startswith("swin_unet"):
+        options = dict(image_size=64) | options
+    mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
+    model = create_model(
+        f"{family}_nano", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
+    ).eval()
+    for layer in model.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+    return model
+
+
+def size_of(model):
+    return model.image_size or (70, 80)
+
+
+def network_of(model, folder, lens=ROUND, **options):
+    path = Path(folder, "camera.safetensors")
+    camera.export_network(model, lens, size_of(model), path, **options)
+    return frames.Network(path)

@@ -81,8 +81,8 @@ def test_the_frames_of_a_plan_are_what_the_view_sees(name, output, tmp_path):
         seen = np.moveaxis(seen, -3, -1) * 255
     assert found.shape == seen.shape
     np.testing.assert_allclose(found, seen, atol=3e-3 if output == "image" else 0.6)
-    plan.save(tmp_path / "plan.npz")
-    again = frames.Plan.load(tmp_path / "plan.npz")
+    plan.save(tmp_path / "plan.safetensors")
+    again = frames.Plan.load(tmp_path / "plan.safetensors")
     assert again == plan and again.supersampling == plan.supersampling == (2 if options else 1)
     np.testing.assert_array_equal(frames.Sampler(again)(frame), found)
 

@@ -21,13 +21,17 @@ void require(bool condition, const char* what) {
   if (!condition) throw std::invalid_argument(std::string("the program of a network ") + what);
 }
 
-// The product of sizes, each at least 0. Throws if it is too large.
+int64_t checked_size(int64_t size) {
+  require(size >= 1 && size <= kMostNumbers, "has a size out of range");
+  return size;
+}
+
+// The product of sizes. Throws if it is too large.
 int64_t product(std::initializer_list<int64_t> sizes) {
   int64_t result = 1;
   for (const int64_t size : sizes) {
-    require(size >= 0 && size <= kMostNumbers, "has a size out of range");
-    require(!__builtin_mul_overflow(result, size, &result) && result <= kMostNumbers,
-            "has sizes that are too large");
+    require(checked_size(size) <= kMostNumbers / result, "has sizes that are too large");
+    result *= size;
   }
   return result;
 }
@@ -41,16 +45,14 @@ struct Reader {
     require(at < program.size(), "ends too early");
     return program[at++];
   }
-  int64_t size() {
+  int64_t count() {
     const int64_t value = next();
-    require(value >= 0 && value <= kMostNumbers, "has a size out of range");
+    require(value >= 0 && value <= kMostSlots, "has a count out of range");
     return value;
   }
   std::vector<int64_t> sizes() {
-    const int64_t count = next();
-    require(count >= 0 && count <= static_cast<int64_t>(program.size() - at), "ends too early");
-    std::vector<int64_t> values(count);
-    for (int64_t& value : values) value = size();
+    std::vector<int64_t> values(count());
+    for (int64_t& value : values) value = checked_size(next());
     return values;
   }
 };
@@ -59,12 +61,13 @@ struct Reader {
 
 Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_t words_)
     : program(std::move(program_)), weights(weights_), words(words_) {
+  require(program.size() <= kMostWords, "is too long");
   Reader reader{program};
   inputs = reader.sizes();
   buffers = reader.sizes();
-  const int64_t count = reader.size();
+  const int64_t count = reader.count();
   for (int64_t k = 0; k < count; ++k) {
-    const int64_t buffer = reader.size();
+    const int64_t buffer = reader.count();
     std::vector<int64_t> shape = reader.sizes();
     require(buffer < static_cast<int64_t>(buffers.size()), "has an output without a buffer");
     int64_t numbers = 1;
@@ -76,7 +79,7 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
     outputs.push_back({input_count() + buffer, std::move(shape)});
   }
   while (reader.at < program.size()) {
-    const int64_t opcode = reader.next(), arguments = reader.size();
+    const int64_t opcode = reader.next(), arguments = reader.count();
     require(opcode >= 0 && opcode < static_cast<int64_t>(kArguments.size()) &&
                 arguments == kArguments[opcode] &&
                 arguments <= static_cast<int64_t>(program.size() - reader.at),
@@ -94,9 +97,12 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
 // Throws if a run would take far more memory than such inputs and such layers can need. Maps have
 // as many tokens as an input has numbers, or fewer, and tokens are as wide as a layer. The sizes of
 // buffers are only claims, and a small file must not claim all memory of a machine.
-void Network::check_memory() const {
+void Network::check_memory() {
   int64_t tokens = 1, width = 1, most = 0, wanted = 0;
-  for (const int64_t numbers : inputs) tokens = std::max(tokens, numbers);
+  for (const int64_t numbers : inputs) {
+    tokens = std::max(tokens, numbers);
+    require((total += numbers) <= kMostNumbers, kTooLarge);
+  }
   for (const Step& step : steps) {
     for (const Layer* layer : {&step.layer, &step.block.qkv, &step.block.fc1}) {
       width = std::max(width, layer->columns);
@@ -105,6 +111,7 @@ void Network::check_memory() const {
   if (__builtin_mul_overflow(tokens, width, &most)) most = kMostNumbers;
   most = std::clamp(most, kFreeNumbers, kMostNumbers);
   for (const int64_t numbers : buffers) require((wanted += numbers) <= most, kTooLarge);
+  total += wanted;
   for (const Step& step : steps) {
     if (step.opcode != Opcode::block) continue;
     const WindowAttentionArgs<float>& map = step.block.windows;
@@ -124,8 +131,8 @@ void Network::fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writ
 
 Layer Network::layer_at(int64_t offset, int64_t depth, int64_t columns,
                         int64_t is_quantized) const {
-  require(depth > 0 && columns > 0 && (is_quantized == 0 || is_quantized == 1),
-          "has an empty layer");
+  require(is_quantized == 0 || is_quantized == 1, "has an unknown kind of layer");
+  product({depth, columns});
   product({depth + kPanelUnit, columns + kPanelUnit, 4});
   require(is_quantized == 0 || depth <= kMostDepth, "has a sum that does not fit 32 bits");
   const int64_t count = Layer::words(depth, columns, is_quantized == 1);
@@ -136,8 +143,7 @@ Layer Network::layer_at(int64_t offset, int64_t depth, int64_t columns,
 // The parameters of a norm are its weight and its bias, then its eps.
 Norm Network::norm_at(int64_t offset, int64_t dim) const {
   const int64_t count = product({dim, 2}) + 1;
-  require(dim > 0 && offset >= 0 && offset <= words && count <= words - offset,
-          "reads beyond its weights");
+  require(offset >= 0 && offset <= words && count <= words - offset, "reads beyond its weights");
   const auto* parameters = reinterpret_cast<const float*>(weights) + offset;
   return {parameters, dim, parameters[2 * dim]};
 }
@@ -202,15 +208,16 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
             slot >= (side == 0 ? 0 : first) && slot < first + static_cast<int64_t>(buffers.size()),
             "names a slot that it does not have");
         const int64_t* sizes = a + 4;
-        int64_t last = a[2 + side];
-        product({last});
-        for (int axis = 0; axis < kCopyAxes; ++axis) {
-          require(sizes[axis] > 0, "copies nothing");
-          last += product({sizes[axis] - 1, sizes[kCopyAxes * (1 + side) + axis]});
-          product({last});
-        }
         const int64_t numbers = slot < first ? inputs[slot] : buffers[slot - first];
-        require(last < numbers, "copies beyond a slot");
+        int64_t last = a[2 + side];
+        require(last >= 0 && last < numbers, "copies beyond a slot");
+        for (int axis = 0; axis < kCopyAxes; ++axis) {
+          const int64_t steps = checked_size(sizes[axis]) - 1,
+                        stride = sizes[kCopyAxes * (1 + side) + axis];
+          require(stride >= 0 && (steps == 0 || stride <= (numbers - 1 - last) / steps),
+                  "copies beyond a slot");
+          last += steps * stride;
+        }
         require(side == 0 || product({a[4], a[5], a[6], a[7], a[8]}) <= numbers,
                 "copies to a place twice");
       }
@@ -226,7 +233,6 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
     }
     case Opcode::mean:
       apart();
-      require(a[2] > 0, "has a mean of nothing");
       fits(a[0], {a[2], a[3]}, false);
       fits(a[1], {a[3]}, true);
       break;
@@ -247,7 +253,6 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       apart();
       fits(a[0], {a[2], a[3], a[6]}, false);
       fits(a[1], {a[4], a[5], a[6]}, true);
-      require(product({a[2], a[3]}) > 0, "samples an empty map");
       if (opcode == Opcode::sample) fits(a[7], {a[4], a[5], 2}, false);
       break;
     case Opcode::to_image:
@@ -256,8 +261,7 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       fits(a[1], {a[5], a[6], a[4]}, true);
       fits(a[7], {a[5], kPosition, a[6]}, false);
       require(a[7] < input_count(), "has a plan that is no input");
-      require(a[2] > 0 && a[3] > 0 && a[2] <= (1 << 24) && product({a[2], a[3]}) <= INT32_MAX,
-              "has too many tokens");
+      require(a[2] <= (1 << 24) && product({a[2], a[3]}) <= INT32_MAX, "has too many tokens");
       break;
   }
   return step;

@@ -35,7 +35,10 @@ enum class Opcode : int64_t {
 };
 
 constexpr int64_t kCopyAxes = 5;
-constexpr int64_t kMostNumbers = int64_t{1} << 40;  // of a program, and of the buffers of a run
+// All sizes are at least 1, so that no instruction takes more steps than its slots have numbers.
+constexpr int64_t kMostNumbers = int64_t{1} << 40;  // of a program, and of the slots of a run
+constexpr int64_t kMostSlots = 1 << 14;             // of a kind
+constexpr int64_t kMostWords = 1 << 18;             // of a program
 // A program may always have buffers of so many numbers for an image, 64 MB. More than that must
 // follow from its inputs and its layers.
 constexpr int64_t kFreeNumbers = int64_t{1} << 24;
@@ -81,12 +84,13 @@ class Network {
   Norm norm_at(int64_t offset, int64_t dim) const;
   Block block_of(const int64_t* arguments) const;
   void fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const;
-  void check_memory() const;
+  void check_memory();
 
   std::vector<int64_t> program;
   const uint32_t* weights;
   int64_t words;
   std::vector<int64_t> inputs, buffers;
+  int64_t total = 1;  // at least the numbers of all slots, for one image
   std::vector<Output> outputs;
   std::vector<Step> steps;
 };

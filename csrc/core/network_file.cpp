@@ -1,6 +1,7 @@
 #include "network_file.h"
 
 #include <algorithm>
+#include <charconv>
 #include <cmath>
 #include <iterator>
 #include <stdexcept>
@@ -14,11 +15,11 @@ void require(bool condition, const char* what) {
   if (!condition) throw std::invalid_argument(what);
 }
 
-std::unique_ptr<const FrameSampler> sampler_of(const Archive& file) {
+std::unique_ptr<const FrameSampler> sampler_of(const TensorFile& file) {
   const auto mean = file.numbers<double>("plan.mean"), std = file.numbers<double>("plan.std");
   const auto size = file.numbers<int64_t>("plan.size");
   require(mean.size() == std.size() && size.size() == 2, "its plan does not fit together");
-  FramePlan plan{.shape = file.array("plan.columns").shape,
+  FramePlan plan{.shape = file.shape("plan.columns"),
                  .columns = file.numbers<int16_t>("plan.columns"),
                  .rows = file.numbers<int16_t>("plan.rows"),
                  .right = file.numbers<float>("plan.right"),
@@ -28,7 +29,7 @@ std::unique_ptr<const FrameSampler> sampler_of(const Archive& file) {
                  .scale = {},
                  .offset = {},
                  .output = file.text("plan.output"),
-                 .reads = file.number<int64_t>("plan.reads")};
+                 .reads = file.number<int64_t>("plan.supersampling")};
   for (size_t c = 0; c < mean.size(); ++c) {
     plan.scale.push_back(static_cast<float>(1 / (255 * std[c])));
     plan.offset.push_back(static_cast<float>(-mean[c] / std[c]));
@@ -53,11 +54,12 @@ void softmax(float* x, int64_t count) {
 }  // namespace
 
 FrameNetwork::FrameNetwork(const std::string& path) try : file(path) {
-  const auto version = file.numbers<int64_t>("darswin_network");
-  require(version.size() == 2, "its version is damaged");
-  require(version[0] <= kFileVersion[0],
-          "it comes from a newer version of darswin: update darswin");
-  require(version[0] == kFileVersion[0],
+  const std::string& version = file.text("darswin_network");
+  int64_t major = -1;
+  std::from_chars(version.data(), version.data() + version.size(), major);
+  require(major >= 0, "its version is damaged");
+  require(major <= kFileVersion[0], "it comes from a newer version of darswin: update darswin");
+  require(major == kFileVersion[0],
           "it comes from an older version of darswin: export the network again");
   size = file.numbers<int64_t>("plan.size");
   sampler = sampler_of(file);
@@ -66,9 +68,11 @@ FrameNetwork::FrameNetwork(const std::string& path) try : file(path) {
   network = std::make_unique<const Network>(std::vector<int64_t>(program.begin(), program.end()),
                                             reinterpret_cast<const uint32_t*>(weights.data()),
                                             static_cast<int64_t>(weights.size()));
-  names = file.strings("labels");
+  while (const auto* label = file.find_text("label." + std::to_string(names.size()))) {
+    names.push_back(*label);
+  }
 
-  const std::string finish = file.text("finish");
+  const std::string& finish = file.text("finish");
   const std::string known[] = {"probabilities", "array", "list"};
   const auto* found = std::find(std::begin(known), std::end(known), finish);
   require(found != std::end(known), "it finishes its outputs in a way that is not known");

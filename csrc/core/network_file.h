@@ -1,14 +1,5 @@
 // A network for the frames of one camera, from a file of darswin.deploy.camera.export_network.
-//
-// The file is an archive as np.savez writes it, of these arrays:
-//   darswin_network  the version of the format, (2,) int64: see kFileVersion
-//   program          of a Network, int64; weights: its words, int32
-//   plan.*           columns, rows, right, lower, size, output, mean, std and reads of a
-//                    darswin.frames.Plan: the samples of a frame are input 0
-//   reads_frame      int64, 0 or 1: whether input 1 is the frame itself, normalized, (H, W, C)
-//   constants        float32: the numbers of all other inputs, one after the other
-//   finish           what becomes of the outputs: see Finish
-//   labels           the names of the classes, if they have some
+// docs/reference/files.md describes the file.
 #pragma once
 
 #include <cstdint>
@@ -17,15 +8,15 @@
 #include <string>
 #include <vector>
 
-#include "archive.h"
 #include "frame.h"
 #include "network.h"
+#include "tensor_file.h"
 
 namespace darswin {
 
 // {major, minor}. Files of another major version are refused. A minor version only adds arrays that
 // older libraries need not read.
-inline constexpr int64_t kFileVersion[] = {1, 0};
+inline constexpr int64_t kFileVersion[] = {2, 0};
 
 class FrameNetwork {
  public:
@@ -55,7 +46,7 @@ class FrameNetwork {
   void run(const Frame& frame, float* const* outputs) const;
 
  private:
-  const Archive file;  // the network reads its weights here
+  const TensorFile file;  // the network reads its weights here
   std::span<const int64_t> size;
   std::unique_ptr<const FrameSampler> sampler;
   std::unique_ptr<const Network> network;

@@ -307,8 +307,6 @@ struct Network::Run {
 
 void Network::run(int64_t batch, const Input* given, float* const* results) const {
   if (batch == 0) return;
-  int64_t total = 1;
-  for (const int64_t count : buffers) total += count;
   if (batch > kMostNumbers / total) throw std::invalid_argument("the batch is too large");
   const int64_t slots = input_count() + static_cast<int64_t>(buffers.size());
   Run run{*this, batch, std::vector<const float*>(slots), std::vector<float*>(slots),

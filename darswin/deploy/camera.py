@@ -11,7 +11,8 @@ from torch import nn
 from darswin.deploy.networks import frame_program
 from darswin.deploy.optimize import check_model, optimized
 from darswin.deploy.program import NoProgramError
-from darswin.frames.plans import Output, Plan, check_name, check_output, check_size, write_arrays
+from darswin.frames.plans import Output, Plan, check_output, check_size
+from darswin.frames.tensor_file import check_name, write_tensors
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -24,7 +25,7 @@ __all__ = ["export_network", "plan"]
 
 # The output of a plan, and its mean and std; None for those of the model or the view.
 _Form = tuple[Output | None, float | Sequence[float] | None, float | Sequence[float] | None]
-_VERSION = (1, 0)  # csrc/core/network_file.h describes the file
+_VERSION = "2.0"  # of the file, as in csrc/core/network_file.h
 
 
 def plan(
@@ -80,7 +81,7 @@ def export_network(
             mode. If it is quantized (see `quantize_model`), the network computes with 8 bits.
         lens: the lens of the camera; None if the model ignores its lens.
         size: (H, W) of the frames.
-        path: of the file; its name ends in ".npz".
+        path: of the file; its name ends in ".safetensors".
         labels: the names of the classes; by default those of the model, if it was loaded from a
             file that has them.
         mean, std: the normalization of the frames, a number for all channels or one for each; by
@@ -125,20 +126,17 @@ def export_network(
     constants = [np.zeros(0, np.float32), *(one.numpy().ravel() for one in program.constants)]
     is_list = isinstance(model, FeatureMaps)
     finish = "probabilities" if program.is_classifier else "list" if is_list else "array"
-    parts = places.parts()
-    parts["reads"] = parts.pop("supersampling")  # its name in the file
-    write_arrays(
+    write_tensors(
         path,
-        {f"plan.{name}": value for name, value in parts.items()}
+        {"reads_frame": np.array(program.reads_frame, np.int64)}
+        | {f"plan.{name}": array for name, array in places.arrays().items()}
         | dict(
-            darswin_network=_VERSION,
             program=np.array(program.words, np.int64),
-            weights=program.weights.numpy(),
-            reads_frame=int(program.reads_frame),
             constants=np.concatenate(constants),
-            finish=finish,
-            labels=np.array(names, str),
+            weights=program.weights.numpy(),
         ),
+        {"darswin_network": _VERSION, "plan.output": places.output, "finish": finish}
+        | {f"label.{k}": name for k, name in enumerate(names)},
     )
 
 

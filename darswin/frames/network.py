@@ -21,7 +21,8 @@ class Network:
     and type, and in other memory than the frame. `threads` is the most threads to use.
 
     Args:
-        path: a file of `darswin.deploy.camera.export_network`.
+        path: a file of `darswin.deploy.camera.export_network`. The weights stay there: replace it
+            by another file if it changes, and do not write into it.
 
     Attributes:
         size: (H, W) of the frames.

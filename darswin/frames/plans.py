@@ -1,25 +1,26 @@
 """Plans: where the frames of one camera are read, and the sampler that reads them there."""
 
-import hashlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from io import BytesIO
-from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 import numpy as np
 
 from darswin.frames.compiled import frames
-from darswin.utils.files import replace_file
+from darswin.frames.tensor_file import read_tensors, write_tensors
 from darswin.utils.tables import read_table
 
 Output = Literal["tokens", "image", "uint8"]
-_VERSION = 4
+_VERSION = 5
 _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
+_KINDS = dict(  # of the arrays of a file
+    size=np.int64, mean=np.float64, std=np.float64, supersampling=np.int64,
+    columns=np.int16, rows=np.int16, right=np.float32, lower=np.float32,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,14 +203,19 @@ class Plan:
         return places.reshape(-1, height * k, width * k, 2)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
+        """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in
+        ".safetensors".
 
         Raises:
-            ValueError: the name has another ending.
+            ValueError: the name has another ending, or the plan is larger than 2 GB.
             OSError: the file cannot be written.
         """
-        content = dict(self.parts(), darswin_plan=_VERSION)
-        write_arrays(path, content | dict(digest=_digest(content)))
+        write_tensors(path, self.arrays(), {"darswin_plan": str(_VERSION), "output": self.output})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The attributes that are numbers, as arrays for a file."""
+        parts = self.parts()
+        return {name: np.asarray(parts[name], kind) for name, kind in _KINDS.items()}
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Plan":
@@ -219,37 +225,34 @@ class Plan:
             ValueError: the file is no plan, is damaged, or comes from another version of darswin.
             OSError: the file cannot be read.
         """
-        name = os.fspath(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                damaged = file.zip.testzip()
-                content = dict(file)
-            version = int(content["darswin_plan"])
-        except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
-            if isinstance(error, OSError) and error.filename is not None:
-                raise  # the file cannot be read
-            raise ValueError(f"{name} is no plan of darswin.frames, or it is damaged") from error
-        if version > _VERSION:
-            raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
-        if version < _VERSION:
-            raise ValueError(f"{name} comes from an older version of darswin: make the plan again")
-        try:
-            if damaged or content.pop("digest").item() != _digest(content):
-                raise ValueError("other values than those that were written")
-            height, width = content["size"].tolist()
+            arrays, texts = read_tensors(path)
+            version = int(texts["darswin_plan"])
+            if version > _VERSION:
+                raise ValueError("it comes from a newer version of darswin: update darswin")
+            if version < _VERSION:
+                raise ValueError("it comes from an older version of darswin: make the plan again")
+            for name, kind in _KINDS.items():
+                if arrays[name].dtype != kind:
+                    raise TypeError(f"its array {name!r} has another type")
+            places = {name: arrays[name] for name in ("columns", "rows", "right", "lower")}
+            if len({array.shape for array in places.values()}) > 1:
+                raise ValueError("its places do not fit together")
+            check_output(texts["output"])
+            height, width = check_size(arrays["size"].tolist())
             return cls(
-                columns=content["columns"],
-                rows=content["rows"],
-                right=content["right"],
-                lower=content["lower"],
+                **places,
                 size=(height, width),
-                output=content["output"].item(),
-                mean=tuple(content["mean"].tolist()),
-                std=tuple(content["std"].tolist()),
-                supersampling=content["supersampling"].item(),
+                output=cast(Output, texts["output"]),
+                mean=tuple(arrays["mean"].tolist()),
+                std=tuple(arrays["std"].tolist()),
+                supersampling=arrays["supersampling"].item(),
             )
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
+        except (KeyError, TypeError, ValueError) as error:
+            what = f"{error} is missing" if isinstance(error, KeyError) else error
+            raise ValueError(
+                f"{os.fspath(path)} is no plan that darswin.frames can read: {what}"
+            ) from error
 
 
 def check_output(output: str) -> None:
@@ -263,30 +266,6 @@ def check_size(size: tuple[int, int]) -> tuple[int, int]:
     if max(size) > _LARGEST_SIDE:
         raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
     return size
-
-
-def check_name(path: str | os.PathLike) -> None:
-    """ValueError unless the name of a file of arrays ends in ".npz"."""
-    if Path(path).suffix != ".npz":
-        raise ValueError(f"the name of the file must end in .npz, got {os.fspath(path)!r}")
-
-
-def write_arrays(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
-    """Writes arrays, in C order and not compressed, completely or not at all."""
-    check_name(path)
-    buffer = BytesIO()
-    arrays = {name: np.asarray(value, order="C") for name, value in content.items()}
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    replace_file(path, buffer.getbuffer())
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    """The SHA-256 of arrays and their names."""
-    total = hashlib.sha256()
-    for name in sorted(content):
-        array = np.asarray(content[name])
-        total.update(f"{name} {array.dtype.str} {array.shape} ".encode() + array.tobytes())
-    return total.hexdigest()
 
 
 class Sampler:

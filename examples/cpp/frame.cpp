@@ -1,4 +1,4 @@
-// Prints the class of a picture, without torch and without Python: frame NETWORK.npz PICTURE.ppm
+// Prints the class of a picture, without torch and without Python: frame NETWORK PICTURE.ppm
 //
 // darswin.deploy.camera.export_network wrote the network of a classifier. The picture is a binary
 // PPM (RGB) or PGM (gray) file with 8 bits and without comments.
@@ -18,7 +18,7 @@ void require(bool condition, const std::string& why) {
 }
 
 int main(int count, char** arguments) try {
-  require(count == 3, "usage: frame NETWORK.npz PICTURE.ppm");
+  require(count == 3, "usage: frame NETWORK PICTURE.ppm");
   const std::unique_ptr<darswin_network, void (*)(darswin_network*)> network(
       darswin_load(arguments[1]), darswin_free);
   require(network != nullptr, darswin_last_error());

@@ -6,13 +6,12 @@ import sys
 from pathlib import Path
 
 import cv2
-import numpy as np
 import onnx
 import pytest
 import torch
 from videos import write_video
 
-from darswin import create_model
+from darswin import create_model, frames
 from darswin.deploy import camera
 from darswin.deploy.export import export_onnx
 from darswin.lens import Equidistant
@@ -32,13 +31,13 @@ def folder(request, tmp_path_factory):
     options = dict(num_classes=4, depths=(1, 1), num_heads=(1, 2), in_chans=request.param)
     model = create_model("darswin_a_nano", **options, mean=0.4, std=0.2).eval()
     torch.nn.init.normal_(model.head.weight)
-    camera.export_network(model, lens, SIZE, folder / "camera.npz")
-    camera.export_network(model, lens, SIZE, folder / "named.npz", labels=LABELS)
-    camera.plan(model, lens, SIZE).save(folder / "plan.npz")
+    camera.export_network(model, lens, SIZE, folder / "camera.safetensors")
+    camera.export_network(model, lens, SIZE, folder / "named.safetensors", labels=LABELS)
+    camera.plan(model, lens, SIZE).save(folder / "plan.safetensors")
     images = torch.zeros(1, request.param, *SIZE, dtype=torch.uint8)
     export_onnx(model, folder / "camera.onnx", images, lens, fixed_lens=True, input="tokens")
     dense = create_model("darswin_unet_a_nano", num_classes=2, in_chans=request.param).eval()
-    camera.export_network(dense, lens, SIZE, folder / "dense.npz")
+    camera.export_network(dense, lens, SIZE, folder / "dense.safetensors")
     classes = []
     write_video(folder / "camera.mp4", count=7, size=SIZE)
     video = cv2.VideoCapture(str(folder / "camera.mp4"))
@@ -58,12 +57,12 @@ def run(folder, *arguments, video="camera.mp4"):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", [[], ["--network", "named.npz"], GRAPH])
+@pytest.mark.parametrize("arguments", [[], ["--network", "named.safetensors"], GRAPH])
 def test_classes_are_those_of_the_whole_model(folder, arguments):
     folder, classes = folder
     done = run(folder, "--threads", "2", *arguments)
     assert done.returncode == 0, done.stderr
-    names = LABELS if "named.npz" in arguments else [*map(str, range(4))]
+    names = LABELS if "named.safetensors" in arguments else [*map(str, range(4))]
     found = re.findall(r"frame (\d+): class (\w+)", done.stdout)
     expected = [(str(n), names[best]) for n, best in enumerate(classes)][::2]
     assert found == expected and len(classes) == 7
@@ -72,7 +71,7 @@ def test_classes_are_those_of_the_whole_model(folder, arguments):
 
 def test_wrong_files_are_explained_in_one_sentence(folder, tmp_path):
     folder, _ = folder
-    (tmp_path / "cut.npz").write_bytes((folder / "camera.npz").read_bytes()[:999])
+    (tmp_path / "cut.safetensors").write_bytes((folder / "camera.safetensors").read_bytes()[:999])
     (tmp_path / "noise.onnx").write_bytes(b"no graph")
     number = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
     same = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
@@ -84,12 +83,16 @@ def test_wrong_files_are_explained_in_one_sentence(folder, tmp_path):
     )
     write_video(tmp_path / "small.mp4", count=2, size=(64, 64))
     for arguments, video, words in [
-        (["--network", tmp_path / "cut.npz"], "camera.mp4", "cut.npz"),
-        (["--network", tmp_path / "none.npz"], "camera.mp4", "No such file"),
-        (["--network", "plan.npz"], "camera.mp4", "plan.npz"),
-        (["--network", "dense.npz"], "camera.mp4", "dense.npz is no classifier"),
-        ([*GRAPH, "--plan", tmp_path / "cut.npz"], "camera.mp4", "no plan of darswin.frames"),
-        ([*GRAPH, "--plan", tmp_path / "none.npz"], "camera.mp4", "No such file"),
+        (["--network", tmp_path / "cut.safetensors"], "camera.mp4", "cut.safetensors"),
+        (["--network", tmp_path / "none.safetensors"], "camera.mp4", "No such file"),
+        (["--network", "plan.safetensors"], "camera.mp4", "plan.safetensors"),
+        (["--network", "dense.safetensors"], "camera.mp4", "dense.safetensors is no classifier"),
+        (
+            [*GRAPH, "--plan", tmp_path / "cut.safetensors"],
+            "camera.mp4",
+            "cut.safetensors is no",
+        ),
+        ([*GRAPH, "--plan", tmp_path / "none.safetensors"], "camera.mp4", "No such file"),
         (["--graph", tmp_path / "noise.onnx"], "camera.mp4", "no ONNX file"),
         (["--graph", tmp_path / "other.onnx"], "camera.mp4", "no graph of a darswin model"),
         ([], tmp_path / "none.mp4", "cannot read the video"),
@@ -112,4 +115,4 @@ def test_the_example_needs_neither_torch_nor_onnxruntime(folder):
         "assert 'torch' not in sys.modules and 'onnxruntime' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True)
-    assert np.load(folder / "plan.npz")["output"] == "tokens"
+    assert frames.Plan.load(folder / "plan.safetensors").output == "tokens"

@@ -108,7 +108,7 @@ def test_frame_prints_the_class_or_one_sentence(programs, tmp_path):
     torch.manual_seed(0)
     lens, size = Spherical.from_fov(0.9, 2.6, 16.0), (32, 40)
     pictures = torch.randint(256, (2, *size, 3), dtype=torch.uint8)
-    network, names = tmp_path / "camera.npz", ["cat", "dog", "車", "tram", "bus"]
+    network, names = tmp_path / "camera.safetensors", ["cat", "dog", "車", "tram", "bus"]
 
     def told(*arguments):
         return result(tmp_path, programs / "frame", *arguments)
@@ -132,15 +132,15 @@ def test_frame_prints_the_class_or_one_sentence(programs, tmp_path):
 
     picture, short = write_ppm(tmp_path / "a.ppm", pictures[0]), tmp_path / "short.ppm"
     short.write_bytes(picture.read_bytes()[:-1])
-    unet, maps = create_model("darswin_unet_a_nano").eval(), tmp_path / "unet.npz"
+    unet, maps = create_model("darswin_unet_a_nano").eval(), tmp_path / "unet.safetensors"
     camera.export_network(unet, lens, size, maps)
     for arguments, error in (
         ([network, picture], "frame must have the network's 1 channels, got 3"),
         ([maps, write_ppm(tmp_path / "b.ppm", pictures[0, 1:])], "the network is no classifier"),
         ([network, short], "short.ppm ends too early"),
-        ([network, network], "camera.npz is not a binary PPM or PGM file .*"),
+        ([network, network], "camera.safetensors is not a binary PPM or PGM file .*"),
         ([picture, picture], "a.ppm is no network that darswin.frames can read: .*"),
-        ([tmp_path / "none.npz", picture], "none.npz: No such file or directory"),
+        ([tmp_path / "none.safetensors", picture], "none.safetensors: No such file or directory"),
         ([], "usage: .*"),
     ):
         assert re.fullmatch(f"frame: .*{error}\n", told(*arguments)), arguments

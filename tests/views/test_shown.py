@@ -214,9 +214,9 @@ def result_of(model, path, images, folder):
         return optimize(model)(images, LENS)
     if path == "export":
         return export_program(model, images, LENS, fixed_lens=True).module()(images)
-    camera.export_network(model, LENS, SIZE, folder / "n.npz")
+    camera.export_network(model, LENS, SIZE, folder / "n.safetensors")
     frame = images[0].permute(1, 2, 0).contiguous().numpy()
-    return torch.from_numpy(frames.Network(folder / "n.npz")(frame))[None]
+    return torch.from_numpy(frames.Network(folder / "n.safetensors")(frame))[None]
 
 
 @torch.no_grad()

@@ -23,7 +23,7 @@ typedef struct {
   int64_t row_stride, column_stride, channel_stride;
 } darswin_frame;
 
-/* The version of the library, such as "1.2.0", and of the files that it reads, such as "1.0". It
+/* The version of the library, such as "1.2.0", and of the files that it reads, such as "2.0". It
  * reads files of the same first number. */
 const char* darswin_version(void);
 const char* darswin_file_version(void);
