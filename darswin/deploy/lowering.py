@@ -121,7 +121,7 @@ def _(condition: Tensor, x: Recorded, other: float) -> Recorded:
     """Pixels (1, K, H, W) where the condition (1, 1, H, W) is true, else 0."""
     if isinstance(condition, Recorded) or other != 0.0:
         raise NoProgramError("a choice between values is no instruction")
-    if condition.all():
+    if x.writer.for_file and condition.all():  # else other lenses may show less
         return x
     rows, columns = (torch.arange(side) for side in condition.shape[2:])
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]

@@ -19,6 +19,7 @@ from darswin.views import PolarView
 from darswin.views.base import Pair, PreparedPolar, size_of
 
 _MOST = 4  # results of `prepare` whose inputs are kept
+_FOVS = 2.0, 6.0  # rad, of lenses for which programs are tried
 Forward = Callable[[Tensor, Prepared, Tensor | None], Any]
 
 
@@ -59,9 +60,9 @@ class Programs:
         self._known: dict[Any, _Known] = {}
         self._bound: dict[int, _Bound] = {}
         size = model.image_size or tuple(model.pretrained_cfg["input_size"][1:])
-        lens = Equidistant.from_fov(2.0, min(size) / 2) if model.uses_lens else None
+        shapes = [of for of in (seen_by(model), _images(model, size)) if of is not None]
         with torch.no_grad():
-            self._bind(layers.prepare(lens, size), (seen_by(model), _images(model, size)))
+            self._bind(_prepared_for_some_lens(model, layers, size), tuple(shapes))
 
     def __call__(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
         refuse_gradients(x)
@@ -94,10 +95,10 @@ class Programs:
         else:
             each = [self._trace(_of_lens(read, k), shapes).given for k in range(count)]
             inputs = [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
-        if len(self._bound) >= _MOST:
-            self._bound.pop(next(iter(self._bound)))
-        self._bound[id(prepared)] = _Bound(prepared, shapes, known, inputs)
-        return self._bound[id(prepared)]
+        bound = _Bound(prepared, shapes, known, inputs)
+        kept = [*self._bound.items()][1 - _MOST :]
+        self._bound = dict(kept) | {id(prepared): bound}  # a new one, for other threads
+        return bound
 
     def _written(self, prepared: Prepared, shapes: Any) -> _Known:
         trace = self._trace(prepared, shapes)
@@ -113,6 +114,17 @@ class Programs:
     def _trace(self, prepared: Prepared, shapes: Any) -> Trace:
         seen, *images = shapes
         return traced(self._model, self._forward, self._weights, seen, prepared, *images or [None])
+
+
+def _prepared_for_some_lens(model: Model, layers: Any, size: Pair) -> Prepared:
+    if not model.uses_lens:
+        return layers.prepare(None, size)
+    for fov in _FOVS:
+        try:
+            return layers.prepare(Equidistant.from_fov(fov, min(size) / 2), size)
+        except ValueError:  # the view sees nothing of it, or takes no such angles
+            continue
+    raise NoProgramError("its view, which shows nothing of usual lenses")
 
 
 class FrameProgram(NamedTuple):

@@ -100,12 +100,13 @@ class Trace:
     """The program of a network for what it sees of one image, in the course of its writing.
 
     Attributes:
+        for_file: whether the program is of one lens alone.
         given: the tensors that are inputs, after those that every image has.
         results: the outputs; is_list: whether the network returns a list of them.
     """
 
-    def __init__(self, weights: Weights):
-        self.program = Program(weights)
+    def __init__(self, weights: Weights, *, for_file: bool = False):
+        self.program, self.for_file = Program(weights), for_file
         self.given: list[Tensor] = []
         self._inputs: dict[Any, Slot] = {}
         self.results: list[Output] = []
@@ -240,7 +241,7 @@ def traced(
     Raises:
         NoProgramError: names the module and the function that is no instruction.
     """
-    trace = Trace(weights)
+    trace = Trace(weights, for_file=for_file)
     x, pixels = trace.input(*seen), None
     if images is not None:
         channels, *size = images

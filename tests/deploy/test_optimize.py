@@ -10,10 +10,11 @@ import pytest
 import torch
 from helpers import network, product, relative_error
 
-from darswin import optimize
+from darswin import create_model, optimize
 from darswin.layers.position_bias import RelativeBias
-from darswin.lens import Spherical
+from darswin.lens import Spherical, cat
 from darswin.models.base import Model
+from darswin.views import make_view
 
 LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 
@@ -86,6 +87,28 @@ def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():
     assert fast(torch.rand(1, 3, 32, 32)).shape == (1, 5)
     with pytest.raises(ValueError, match=r"\(H, W\) = \(32, 32\)"):
         fast(torch.rand(1, 3, 40, 32))
+
+
+@torch.no_grad()
+def test_each_lens_of_a_program_hides_its_own_pixels():
+    model = network("swin_unet_nano square", task="distance")
+    large, small = (Spherical.from_fov(0.5, math.radians(160), radius) for radius in (60.0, 20.0))
+    images, fast = torch.randn(1, 3, 64, 64), optimize(model, strict=True)
+    for lens in (large, small, large):
+        want, got = model(images, lens), fast(images, lens)
+        assert torch.equal(got == 0, want == 0) and relative_error(got, want) < 1e-5
+    assert bool(model.prepare(large, (64, 64)).view.shown.all())
+    both, images = cat([large, small]), torch.cat((images, images))
+    assert relative_error(fast(images, both), model(images, both)) < 1e-5
+
+
+@torch.no_grad()
+def test_a_program_is_tried_with_lenses_that_its_view_sees(monkeypatch):
+    view = make_view("perspective", 64, fov=0.5, direction=(0.0, 0.0, -1.0))
+    model = create_model("swin_nano", num_classes=5, view=view).eval()
+    optimize(model, strict=True)
+    monkeypatch.setattr("darswin.deploy.networks._FOVS", (2.0,))
+    assert "layer by layer, because of its view" in repr(optimize(model))
 
 
 def test_the_model_stays_as_it_is():
