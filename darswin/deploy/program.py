@@ -1,6 +1,7 @@
 """Programs of networks: the instructions of csrc/core/network.h."""
 
 import struct
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -152,6 +153,7 @@ class Program:
         """The steps, of which those with a `base` change it in place or a copy of it; and the
         buffer whose memory a buffer takes."""
         last = {slot.key: k for k, step in enumerate(self._steps) for slot in step.reads}
+        readers = Counter(slot.key for step in self._steps for slot in step.reads)
         last |= {slot.key: len(self._steps) for slot in self._outputs}
         steps: list[Step] = []
         place: dict[tuple[bool, int], tuple[bool, int]] = {}
@@ -166,12 +168,12 @@ class Program:
                 step = replace(step, base=base, arguments=(other, step.out))
             if base is not None and base.is_buffer and free:
                 place[step.out.key] = place.get(base.key, base.key)
-                before = made.get(base.key)
+                before = made.get(base.key) if readers[base.key] == 1 else None
                 if step.opcode == GELU and before is not None and before.opcode == CONV:
                     before.arguments = (*before.arguments[:-1], AND_GELU)
                     continue
             elif base is not None and step.opcode != NORM:
-                steps.append(_copied(base, step.out))
+                steps.append(_copy(base, step.out, [(base.numbers, 1, 1)]))
             steps.append(step)
             made[step.out.key] = step
         return steps, place
@@ -232,12 +234,8 @@ class Program:
     ) -> Slot:
         """Copies an array of up to five axes between places with these strides; `begin` and `to`
         are where reading and writing begin."""
-        if len(sizes) > COPY_AXES:
-            raise NoProgramError(f"a copy with {len(sizes)} axes is no instruction")
-        axes = zip(sizes, reads, writes, strict=True)
-        padded = [(1, 0, 0)] * (COPY_AXES - len(sizes)) + list(axes)
-        places = chain.from_iterable(zip(*padded, strict=True))
-        return self._step(COPY, out, [x], x, out, begin, to, *places)
+        self._steps.append(_copy(x, out, list(zip(sizes, reads, writes, strict=True)), begin, to))
+        return out
 
     def permuted(self, x: Slot, sizes: Sequence[int], order: Sequence[int], *shape: int) -> Slot:
         """The axes of x, which has these sizes, in another order, as a new buffer of a shape."""
@@ -294,10 +292,15 @@ class Program:
         return self._step(DISTANCE, out, [x], out, *bits, base=x)
 
 
-def _copied(x: Slot, out: Slot) -> Step:
-    padding = [1] * (COPY_AXES - 1), [0] * (COPY_AXES - 1)
-    sizes, (reads, writes) = [*padding[0], x.numbers], [[*padding[1], 1]] * 2
-    return Step(COPY, out, [x], (x, out, 0, 0, *sizes, *reads, *writes))
+def _copy(
+    x: Slot, out: Slot, axes: Sequence[tuple[int, int, int]], begin: int = 0, to: int = 0
+) -> Step:
+    """The step of `Program.copy`; axes: their size, and the strides of reading and writing."""
+    if len(axes) > COPY_AXES:
+        raise NoProgramError(f"a copy with {len(axes)} axes is no instruction")
+    padded = [(1, 0, 0)] * (COPY_AXES - len(axes)) + list(axes)
+    places = chain.from_iterable(zip(*padded, strict=True))
+    return Step(COPY, out, [x], (x, out, begin, to, *places))
 
 
 def _strides(sizes: Sequence[int]) -> list[int]:

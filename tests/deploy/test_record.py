@@ -78,6 +78,7 @@ IMAGES = {  # functions of images (1, 3, 4, 6)
     "conv": lambda x: CONV(x),
     "conv and gelu": lambda x: F.gelu(CONV(x)),
     "conv that is read twice": lambda x: F.gelu(y := CONV(x)) + y,
+    "conv that is read before its gelu": lambda x: ((y := CONV(x)) + y) + F.gelu(y),
     "convs": lambda x: (y := F.gelu(CONV(x))) + F.gelu(CONV2(y)),
     "conv of two": lambda x: CONV(torch.cat((x[:, 1:], x[:, :1]), 1)),
     "resized": lambda x: F.interpolate(x, (7, 3), mode="bilinear"),
