@@ -30,8 +30,8 @@ def _(norm: OwnNorm, x: Recorded) -> Recorded:
 
 @lowers(OwnBlocks.__call__)
 def _(blocks: OwnBlocks, x: Recorded, tables: Sequence[Tensor]) -> Recorded:
-    trace, inputs = x.writer, [x.writer.of(table).slot for table in tables]
-    return trace.filled(trace.program.blocks(trace.dense(x), blocks, inputs))  # type: ignore[arg-type]
+    trace, inputs = x.writer, [x.writer.input_of(table) for table in tables]
+    return trace.filled(trace.program.blocks(trace.dense(x), blocks, inputs))
 
 
 # -- functions between them ----------------------------------------------------------------------
@@ -117,7 +117,7 @@ def _viewed(place: Recorded, shape: Sequence[int]) -> Recorded | None:
 
 
 @lowers(torch.where)
-def _(condition: Tensor, x: Recorded, other: float) -> Recorded:
+def _(condition: Tensor, x: Recorded, other: float) -> Tensor:
     """Pixels (1, K, H, W) where the condition (1, 1, H, W) is true, else 0."""
     if isinstance(condition, Recorded) or other != 0.0:
         raise NoProgramError("a choice between values is no instruction")
@@ -125,7 +125,7 @@ def _(condition: Tensor, x: Recorded, other: float) -> Recorded:
         return x
     rows, columns = (torch.arange(side) for side in condition.shape[2:])
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
-    return sample_at(x, torch.where(condition[:, 0, :, :, None], pixels, OUTSIDE))  # type: ignore[return-value]
+    return sample_at(x, torch.where(condition[:, 0, :, :, None], pixels, OUTSIDE))
 
 
 # -- maps and pixels -----------------------------------------------------------------------------
@@ -151,8 +151,7 @@ def _(x: Recorded, size: Any, mode: str, align_corners: bool | None, **others: A
 @lowers(sample_at)
 def _(images: Recorded, pixels: Tensor) -> Recorded:
     trace = images.writer
-    points = trace.of(pixels.float()).slot
-    assert points is not None
+    points = trace.input_of(pixels.float())
     return trace.filled(trace.program.sampled(trace.dense(images, _LAST), points), _FIRST)
 
 
@@ -166,6 +165,4 @@ def _(x, radii, center, size, *, affine, points, r_max, plan, layout) -> Recorde
     if layout != "tokens" or plan is None:
         raise NoProgramError("polar_to_image without a plan is no instruction")
     trace = x.writer
-    there = trace.of(plan).slot
-    assert there is not None
-    return trace.filled(trace.program.to_image(trace.dense(x), there))
+    return trace.filled(trace.program.to_image(trace.dense(x), trace.input_of(plan)))

@@ -1,6 +1,6 @@
 """Whole models as programs: the forward of `optimize` and of `darswin.frames.Network`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +20,6 @@ from darswin.views.base import Pair, PreparedPolar, size_of
 
 _MOST = 4  # results of `prepare` whose inputs are kept
 _FOVS = 2.0, 6.0  # rad, of lenses for which programs are tried
-Forward = Callable[[Tensor, Prepared, Tensor | None], Any]
 
 
 class _Known(NamedTuple):
@@ -85,7 +84,6 @@ class Programs:
         read = _read(prepared)
         leaves = pytree.tree_leaves(read)
         key = shapes, *(one.shape[1:] if isinstance(one, Tensor) else one for one in leaves)
-        count = max((len(one) for one in leaves if isinstance(one, Tensor)), default=1)
         if key not in self._known:
             self._known[key] = self._written(_of_lens(read, 0), shapes)
         known = self._known[key]
@@ -93,6 +91,7 @@ class Programs:
         if known.fields is not None:
             inputs = [leaves[k].detach().float() for k in known.fields]
         else:
+            count = max(len(one) for one in leaves if isinstance(one, Tensor))
             each = [self._trace(_of_lens(read, k), shapes).given for k in range(count)]
             inputs = [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
         bound = _Bound(prepared, shapes, known, inputs)

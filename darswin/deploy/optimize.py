@@ -101,15 +101,15 @@ def optimized(
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
     vars(made).update(weights=libraries.weights)
-    try:
-        if by_onednn:
-            raise NoProgramError("the library oneDNN, which computes its products faster here")
-        vars(made).update(programs=Programs(made, made.layers, libraries.weights))
-    except NoProgramError as error:
-        lack = f"layer by layer, because of {error}"
-        if strict:
-            raise TypeError(f"model must become one program, but it runs {lack}") from error
-        vars(made).update(lack=lack)
+    lack = "oneDNN, whose products are faster here" if by_onednn else ""
+    if not lack:
+        try:
+            vars(made).update(programs=Programs(made, made.layers, libraries.weights))
+        except NoProgramError as error:
+            lack = str(error)
+    if lack and strict:
+        raise TypeError(f"model must become one program, but it runs layer by layer: {lack}")
+    vars(made).update(lack=lack and f"layer by layer, because of {lack}")
     return made
 
 

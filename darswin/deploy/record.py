@@ -18,7 +18,7 @@ from darswin.deploy.program import NoProgramError, Program, Slot, Weights
 from darswin.models.prepared import Prepared
 
 RULES: dict[Any, Callable[..., Any]] = {}  # lowering.py has them
-_RESHAPES = (Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten, Tensor.contiguous)
+_RESHAPES = (Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten)
 
 
 def lowers(*functions: Any) -> Callable[[Callable], Callable]:
@@ -100,7 +100,7 @@ class Trace:
     """The program of a network for what it sees of one image, in the course of its writing.
 
     Attributes:
-        for_file: whether the program is of one lens alone.
+        for_file: whether the program is of one lens alone, in a file.
         given: the tensors that are inputs, after those that every image has.
         results: the outputs; is_list: whether the network returns a list of them.
     """
@@ -141,6 +141,10 @@ class Trace:
             self.given.append(value)
         return self.filled(self._inputs[key])
 
+    def input_of(self, value: Tensor) -> Slot:
+        """The input of a tensor that depends on the lens alone; another value, densely."""
+        return self.dense(self.of(value))
+
     def copy_of(self, source: Recorded, meta: Tensor) -> Recorded:
         """The numbers of a value in C order, in another shape. They are copied if they are used."""
         while source.slot is None:
@@ -173,15 +177,8 @@ class Trace:
             merged.append((size, read, write))
         sizes, reads, writes = zip(*(merged or [(1, 1, 1)]), strict=True)
         assert target.slot is not None
-        self.program.copy(
-            x,
-            target.slot,
-            sizes,
-            reads,
-            writes,
-            int(to.storage_offset()),
-            int(meta.storage_offset()),
-        )
+        places = int(to.storage_offset()), int(meta.storage_offset())
+        self.program.copy(x, target.slot, sizes, reads, writes, *places)
 
     def by_rows(self, x: Recorded, width: int, write: Callable[[Slot], Slot]) -> Recorded:
         """What an instruction makes of the last axis. The rows keep their order in memory."""
@@ -198,12 +195,12 @@ class Trace:
         sizes = (*x.shape[:-1], width)
         return self.value(out, torch.empty_strided(sizes, (*strides, 1), device="meta"))
 
-    def finish(self, results: Any, *, in_order: bool) -> None:
-        """Makes recorded results the outputs; `in_order`: their axes are in order in memory."""
+    def finish(self, results: Any) -> None:
+        """Makes recorded results the outputs. In a file, their axes are in order in memory."""
         self.is_list = not isinstance(results, Tensor)
         for result in results if self.is_list else [results]:
             value = self.of(result)
-            order = list(range(value.dim())) if in_order else value.made().order()
+            order = list(range(value.dim())) if self.for_file else value.made().order()
             slot = self.dense(value, order)
             self.program.output(slot)
             self.results.append(Output(slot, order))
@@ -250,7 +247,7 @@ def traced(
         )
     try:
         with torch.no_grad():
-            trace.finish(forward(x, prepared, pixels), in_order=for_file)
+            trace.finish(forward(x, prepared, pixels))
     except NoProgramError as error:
         raise NoProgramError(f"{_module_of(error, network)}: {error}") from error
     return trace
