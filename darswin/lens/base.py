@@ -226,12 +226,12 @@ class Lens(LensInImage):
             (N, ..., 2) px; NaN for points beyond θ_max and for (0, 0, 0).
         """
         (points,) = self._aligned(points)
-        square = points.square()
-        length = square.sum(-1)
+        across, down, ahead = points.square().unbind(-1)  # not `sum`, as in `length_of`
+        length = across + down + ahead
         # Like `length_of`, this has a gradient on the axis, for any unit of length.
         eps, tiny = torch.finfo(points.dtype).eps, torch.finfo(points.dtype).tiny
         least = (1e-12 * eps * length).clamp(min=tiny)
-        aside = torch.maximum(square[..., :2].sum(-1), least).sqrt()
+        aside = torch.maximum(across + down, least).sqrt()
         theta = torch.atan2(aside, points[..., 2])
         theta = torch.where(length > 0, theta, torch.nan)
         return self.seen_pixels(theta, points[..., :2] / aside[..., None], image_size)

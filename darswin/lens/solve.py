@@ -129,7 +129,7 @@ def newton(
 
 def length_of(points: Tensor) -> Tensor:
     """The length of (..., 2), never 0, where a square root has no slope."""
-    x, y = points.square().unbind(-1)  # ONNX Runtime cannot sum an empty tensor along one axis
+    x, y = points.square().unbind(-1)  # ONNX Runtime cannot reduce one axis of an empty tensor
     return (x + y).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
 
 

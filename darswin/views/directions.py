@@ -262,8 +262,8 @@ class RayView(PixelView):
     def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:
         """True where images of (H, W) show points (N or 1, ..., 2) of the plane, (N, ...)."""
         pixels = self.place(lens, self.from_plane(points) @ self._turn(points).T, size)
-        last = tensor_there((size[1] - 0.5, size[0] - 0.5), pixels)
-        return ((pixels >= -0.5) & (pixels <= last)).all(-1)
+        x, y = pixels.unbind(-1)  # not `all`, as in `length_of`
+        return (x >= -0.5) & (x <= size[1] - 0.5) & (y >= -0.5) & (y <= size[0] - 0.5)
 
     def extra_repr(self) -> str:
         shown = dict(fov=self.fov, theta_max=self.theta_max, supersampling=self.supersampling)

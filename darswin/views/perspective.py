@@ -68,7 +68,8 @@ class PerspectiveView(RayView):
         return torch.where(ahead > 0, flat, torch.nan)
 
     def from_plane(self, points: Tensor) -> Tensor:
-        length = torch.rsqrt(1 + points.square().sum(-1, keepdim=True))
+        x, y = points.split(1, -1)  # not `sum`, as in `length_of`
+        length = torch.rsqrt(1 + x * x + y * y)
         return torch.cat((points * length, length), -1)
 
     def camera(self, lens: Lens, size: Pair) -> Lens:

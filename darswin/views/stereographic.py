@@ -26,5 +26,6 @@ class StereographicView(RayView):
         return 2 * rays[..., :2] / (1 + rays[..., 2:]).clamp(min=1e-12)
 
     def from_plane(self, points: Tensor) -> Tensor:
-        square = points.square().sum(-1, keepdim=True) / 4
+        x, y = points.split(1, -1)  # not `sum`, as in `length_of`
+        square = (x * x + y * y) / 4
         return torch.cat((points, 1 - square), -1) / (1 + square)
