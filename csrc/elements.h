@@ -11,8 +11,11 @@ namespace darswin {
 struct ElementKernels {
   // Adds x to `to`, n numbers each.
   void (*add)(const float* x, float* to, int64_t n);
-  // Replaces n numbers by their GELU.
+  // Replaces n numbers by their GELU, or their ReLU.
   void (*gelu)(float* x, int64_t n);
+  void (*relu)(float* x, int64_t n);
+  // Replaces n numbers by the larger ones of x; NaN is the largest.
+  void (*largest)(const float* x, float* to, int64_t n);
   // Replaces n numbers x by the distances typical * e^(8 tanh(x / 8)).
   void (*distance)(float* x, int64_t n, float typical);
   // Writes the weighted sum of four rows of n numbers.

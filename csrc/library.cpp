@@ -50,7 +50,9 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "
       "float eps=1e-05) -> Tensor");
-  m.def("_run(Tensor[] inputs, Tensor weights, int[] program) -> Tensor[]");
+  m.def("_network(Tensor weights, int[] program) -> int");
+  m.def("_forget_network(int network) -> ()");
+  m.def("_run(Tensor[] inputs, int network) -> Tensor[]");
 }
 
 namespace {

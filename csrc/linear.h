@@ -49,6 +49,7 @@ inline int64_t layer_words(int64_t depth, int64_t columns) {
 enum class After {
   nothing,
   gelu,
+  relu,
   add,  // added to the values in `out`
 };
 

@@ -14,7 +14,7 @@ namespace darswin {
 namespace {
 
 // The count of arguments of each opcode, in its order.
-constexpr std::array<int64_t, 12> kArguments = {9, 5, 23, 19, 2, 4, 1, 8, 7, 8, 8, 2};
+constexpr std::array<int64_t, 13> kArguments = {9, 5, 23, 19, 2, 4, 2, 8, 7, 8, 8, 2, 5};
 constexpr char kTooLarge[] = "wants more memory than its inputs and layers can need";
 
 void require(bool condition, const char* what) {
@@ -34,6 +34,11 @@ int64_t product(std::initializer_list<int64_t> sizes) {
     result *= size;
   }
   return result;
+}
+
+// Whether a number is a function that may follow a product.
+bool follows(int64_t after) {
+  return after == static_cast<int64_t>(After::gelu) || after == static_cast<int64_t>(After::relu);
 }
 
 // Reads a program from front to back.
@@ -236,8 +241,9 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       fits(a[0], {a[2], a[3]}, false);
       fits(a[1], {a[3]}, true);
       break;
-    case Opcode::gelu:
+    case Opcode::apply:
     case Opcode::distance:
+      require(opcode == Opcode::distance || follows(a[1]), "has an unknown function");
       require(a[0] >= input_count() && a[0] < input_count() + static_cast<int64_t>(buffers.size()),
               "names a slot that it does not have");
       break;
@@ -246,7 +252,12 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       fits(a[0], {a[2], a[3], a[4]}, false);
       fits(a[1], {a[2], a[3], a[5]}, true);
       step.layer = layer_at(a[6], product({a[4], 9}), a[5], 0);
-      require(a[7] >= 0 && a[7] <= static_cast<int64_t>(After::add), "has an unknown step");
+      require(a[7] == 0 || follows(a[7]), "has an unknown function");
+      break;
+    case Opcode::pool:
+      apart();
+      fits(a[0], {a[2], a[3], a[4]}, false);
+      fits(a[1], {units(a[2], 2), units(a[3], 2), a[4]}, true);
       break;
     case Opcode::resize:
     case Opcode::sample:

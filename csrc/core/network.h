@@ -25,13 +25,14 @@ enum class Opcode : int64_t {
   copy,      // x, out, offset in x, offset in out, sizes (5), strides in x (5), strides in out (5)
   add,       // x, out: out += x
   mean,      // x, out, rows, dim: over the rows
-  gelu,      // x, in place
-  conv,      // x, out, H, W, channels, columns, layer, what follows: nothing, gelu or add (After);
+  apply,     // x, in place, the function: gelu or relu (After)
+  conv,      // x, out, H, W, channels, columns, layer, what follows: nothing, gelu or relu (After);
              // 3 x 3, with zeros around the map
   resize,    // x, out, H, W, H', W', channels: bilinear, pixel centres at half
   sample,    // x, out, H, W, H', W', channels, points (H', W', 2): bilinear, zeros outside
   to_image,  // x, out, R, A, channels, H, W, plan: polar_to_image
   distance,  // x, in place, typical distance as the bits of a float
+  pool,      // x, out, H, W, channels: the largest numbers of 2 x 2 pixels, also of fewer at the ends
 };
 
 constexpr int64_t kCopyAxes = 5;

@@ -151,38 +151,50 @@ struct Network::Run {
     });
   }
 
-  // Collects the 3 x 3 neighbours of some pixels, and multiplies them as a linear layer.
+  // Collects the 3 x 3 neighbours of some pixels, and multiplies them as a linear layer. The threads
+  // share the columns too if there are few pixels.
   void conv(const Step& step) const {
     constexpr int64_t kPixels = 64;  // whose neighbours stay in the cache
-    const int64_t *a = step.arguments, height = a[2], width = a[3], channels = a[4];
-    const int64_t depth = step.layer.depth;
-    const auto& kernel = kernels<LinearKernels<float>>().rows;
     constexpr double kPerMicrosecond = 5e4;  // multiply-adds
-    const double work = static_cast<double>(batch) * height * width * depth * step.layer.columns;
-    const int64_t bytes = kPixels * depth * static_cast<int64_t>(sizeof(float));
-    run_with_scratch(batch * height, threads_for(work / kPerMicrosecond), bytes,
-                     [&](int64_t begin, int64_t end, void* memory) {
-                       auto* tokens = static_cast<float*>(memory);
-                       for (int64_t item = begin; item < end; ++item) {
-                         const int64_t b = item / height, y = item % height;
-                         for (int64_t first = 0; first < width; first += kPixels) {
-                           const int64_t count = std::min(kPixels, width - first);
-                           for (int64_t k = 0; k < count; ++k) {
-                             neighbours(image(a[0], b), height, width, channels, y, first + k,
-                                        tokens + k * depth);
-                           }
-                           const LinearArgs<float> args{
-                               .x = tokens,
-                               .packed = step.layer.packed,
-                               .rows = count,
-                               .depth = depth,
-                               .columns = step.layer.columns,
-                               .after = static_cast<After>(a[7]),
-                               .out = result(a[1], b) + (y * width + first) * step.layer.columns};
-                           kernel(args, 0, count, 0, panel_count(args.columns));
-                         }
-                       }
-                     });
+    const int64_t* a = step.arguments;
+    const int64_t pixels = batch * a[2] * a[3], depth = step.layer.depth;
+    const int64_t columns = step.layer.columns, panels = panel_count(columns);
+    const Threads threads =
+        threads_for(static_cast<double>(pixels) * depth * columns / kPerMicrosecond);
+    const int64_t chunks = units(pixels, kPixels);
+    const int64_t parts = std::min(units(threads, chunks), panels);
+    const auto& kernel = kernels<LinearKernels<float>>().rows;
+    run_with_scratch(
+        chunks * parts, threads, kPixels * depth * static_cast<int64_t>(sizeof(float)),
+        [&](int64_t begin, int64_t end, void* memory) {
+          auto* tokens = static_cast<float*>(memory);
+          for (int64_t item = begin; item < end; ++item) {
+            const int64_t first = item / parts * kPixels, part = item % parts;
+            const int64_t count = std::min(kPixels, pixels - first);
+            if (item == begin || part == 0) neighbours(a, first, count, tokens);
+            const LinearArgs<float> args{.x = tokens,
+                                         .packed = step.layer.packed,
+                                         .rows = count,
+                                         .depth = depth,
+                                         .columns = columns,
+                                         .after = static_cast<After>(a[7]),
+                                         .out = to[a[1]] + first * columns};
+            kernel(args, 0, count, panels * part / parts, panels * (part + 1) / parts);
+          }
+        });
+  }
+  // Writes the neighbours of pixels [first, first + count) of all images.
+  void neighbours(const int64_t* a, int64_t first, int64_t count, float* to) const {
+    const int64_t height = a[2], width = a[3], channels = a[4];
+    for (int64_t pixel = first; pixel < first + count;) {
+      const int64_t row = pixel / width, begin = pixel % width;
+      const int64_t end = std::min(width, begin + first + count - pixel);
+      const float* x = image(a[0], row / height);
+      for (int64_t column = begin; column < end; ++column, to += 9 * channels) {
+        neighbours(x, height, width, channels, row % height, column, to);
+      }
+      pixel += end - begin;
+    }
   }
   static void neighbours(const float* x, int64_t height, int64_t width, int64_t channels, int64_t y,
                          int64_t column, float* to) {
@@ -215,6 +227,26 @@ struct Network::Run {
         const float parts[] = {top * left, top * across.part, down.part * left,
                                down.part * across.part};
         kernel.mix(corners, parts, out, channels);
+      }
+    });
+  }
+
+  void pool(const int64_t* a) const {
+    const int64_t height = a[2], width = a[3], channels = a[4];
+    const int64_t rows = units(height, 2), columns = units(width, 2);
+    const auto& kernel = kernels<ElementKernels>();
+    rows_of_pixels(rows, columns * channels * 4, [&](int64_t b, int64_t y) {
+      float* out = result(a[1], b) + y * columns * channels;
+      for (int64_t row = 2 * y; row < std::min(2 * y + 2, height); ++row) {
+        const float* x = image(a[0], b) + row * width * channels;
+        for (int64_t k = 0; k < width; ++k) {
+          float* to = out + k / 2 * channels;
+          if (row == 2 * y && k % 2 == 0) {
+            std::copy_n(x + k * channels, channels, to);
+          } else {
+            kernel.largest(x + k * channels, to, channels);
+          }
+        }
       }
     });
   }
@@ -287,8 +319,8 @@ struct Network::Run {
         return;
       case Opcode::mean:
         return mean(a);
-      case Opcode::gelu:
-        return each(a[0], [&](float* x, int64_t n) { kernel.gelu(x, n); });
+      case Opcode::apply:
+        return each(a[0], static_cast<After>(a[1]) == After::gelu ? kernel.gelu : kernel.relu);
       case Opcode::conv:
         return conv(step);
       case Opcode::resize:
@@ -301,6 +333,8 @@ struct Network::Run {
         return each(a[0], [&](float* x, int64_t n) {
           kernel.distance(x, n, std::bit_cast<float>(static_cast<int32_t>(a[1])));
         });
+      case Opcode::pool:
+        return pool(a);
     }
   }
 };

@@ -1,4 +1,4 @@
-// The GELU, which products and other kernels share.
+// The GELU and the ReLU, which products and other kernels share.
 #pragma once
 
 #include "math.h"
@@ -20,6 +20,9 @@ inline Floats gelu(Floats x) {
   tail = tail * t * exponential_of_negative(size * size * -0.5f);
   return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
 }
+
+// NaN stays.
+inline Floats relu(Floats x) { return x < 0 ? Floats{} : x; }
 
 }  // namespace
 }  // namespace darswin

@@ -31,6 +31,20 @@ void gelu_all(float* x, int64_t n) {
   replace(x, n, [](Floats v) { return gelu(v); });
 }
 
+void relu_all(float* x, int64_t n) {
+  replace(x, n, [](Floats v) { return relu(v); });
+}
+
+void largest(const float* x, float* to, int64_t n) {
+  const auto at = [&]<typename V>(int64_t k) {
+    const V one = load<V>(x + k), other = load<V>(to + k);
+    store(to + k, other >= one || other != other ? other : one);
+  };
+  int64_t k = 0;
+  for (; k + kL <= n; k += kL) at.template operator()<Floats>(k);
+  for (; k < n; ++k) at.template operator()<float>(k);
+}
+
 // tanh(y) = (1 - e) / (1 + e) with e = e^(-2 |y|), and e^z = 1 / e^-z for positive z. Around 0 the
 // difference 1 - e loses digits of tanh, but the distance depends on 8 tanh(y) as a whole.
 void distance(float* x, int64_t n, float typical) {
@@ -57,6 +71,11 @@ void mix(const float* const from[4], const float weights[4], float* to, int64_t 
 
 }  // namespace
 
-TIER_TABLE(ElementKernels) = {.add = add, .gelu = gelu_all, .distance = distance, .mix = mix};
+TIER_TABLE(ElementKernels) = {.add = add,
+                              .gelu = gelu_all,
+                              .relu = relu_all,
+                              .largest = largest,
+                              .distance = distance,
+                              .mix = mix};
 
 }  // namespace darswin

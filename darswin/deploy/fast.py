@@ -98,11 +98,10 @@ class FastPatchEmbed(nn.Module):
 
 @fast.register
 def _(block: ConvBlock, libraries: Libraries) -> nn.Module:
-    conv1, norm1, relu, conv2, norm2, _ = list[Any](block)
-    first, second = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
-    return nn.Sequential(
-        InDtype(first, libraries.dtype), relu, InDtype(second, libraries.dtype), relu
-    )
+    conv1, norm1, _, conv2, norm2, _ = list[Any](block)
+    fused = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
+    first, second = (InDtype(conv, libraries.dtype) for conv in fused)
+    return nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
 
 
 @fast.register(PolarPatchEmbed)

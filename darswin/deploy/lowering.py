@@ -9,7 +9,7 @@ from torch import Tensor
 
 from darswin.deploy.own import OwnLinear, OwnNorm
 from darswin.deploy.packed import OwnBlocks
-from darswin.deploy.program import NoProgramError
+from darswin.deploy.program import GELU, RELU, NoProgramError
 from darswin.deploy.record import Recorded, inverse, lowers
 from darswin.lens.pixels import OUTSIDE, sample_at
 from darswin.models.pixel import distances
@@ -74,8 +74,20 @@ def _(x: Tensor, y: Tensor) -> Recorded:
 
 @lowers(F.gelu)
 def _(x: Recorded) -> Recorded:
+    return _applied(GELU, x)
+
+
+@lowers(F.relu)
+def _(x: Recorded, inplace: bool = False) -> Recorded:
+    if inplace:
+        raise NoProgramError("a ReLU in place is no instruction")
+    return _applied(RELU, x)
+
+
+def _applied(function: int, x: Recorded) -> Recorded:
     order = x.made().order()
-    return x.writer.filled(x.writer.program.gelu(x.writer.dense(x, order)), inverse(order))
+    found = x.writer.program.apply(function, x.writer.dense(x, order))
+    return x.writer.filled(found, inverse(order))
 
 
 @lowers(distances)
@@ -139,6 +151,15 @@ def _(x, weight, bias=None, stride=1, padding=0, dilation=1, groups=1) -> Record
     if (size, stride, padding, dilation, groups) != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
         raise NoProgramError(f"this convolution of {size[0]} × {size[1]} is no instruction")
     return x.writer.filled(x.writer.program.conv(x.writer.dense(x, _LAST), weight, bias), _FIRST)
+
+
+@lowers(F.max_pool2d)
+def _(x: Recorded, size: Any, stride: Any = None, padding: Any = 0, dilation: Any = 1, *,
+      ceil_mode: bool = False, return_indices: bool = False) -> Recorded:  # fmt: skip
+    usual = (2, None, 0, 1, True, False)
+    if (size, stride, padding, dilation, ceil_mode, return_indices) != usual:
+        raise NoProgramError("this pooling is no instruction")
+    return x.writer.filled(x.writer.program.pooled(x.writer.dense(x, _LAST)), _FIRST)
 
 
 @lowers(F.interpolate)

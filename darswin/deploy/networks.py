@@ -9,7 +9,7 @@ from torch.utils import _pytree as pytree
 
 import darswin.deploy.lowering  # noqa: F401  (it registers the rules)
 from darswin.deploy.packed import refuse_gradients
-from darswin.deploy.program import RUN, NoProgramError, Weights
+from darswin.deploy.program import Checked, NoProgramError, Weights
 from darswin.deploy.record import Trace, inverse, traced
 from darswin.lens import Equidistant
 from darswin.models.base import Model
@@ -26,7 +26,7 @@ class _Known(NamedTuple):
     """A program, and which tensors of a result of `prepare` are its inputs; None if they are
     computed from these tensors."""
 
-    words: list[int]
+    program: Checked
     trace: Trace
     fields: Sequence[int] | None
 
@@ -75,7 +75,7 @@ class Programs:
         if bound is None or bound.shapes != shapes:
             bound = self._bind(prepared, shapes)
         known = bound.known
-        found = RUN([*given, *bound.inputs], self._weights.words, known.words)
+        found = known.program([*given, *bound.inputs])
         results = zip(found, known.trace.results, strict=True)
         outputs = [output.permute(inverse(of.order)) for output, of in results]
         return outputs if known.trace.is_list else outputs[0]
@@ -108,7 +108,7 @@ class Programs:
         }
         fields = [places.get((one.data_ptr(), one.shape)) for one in trace.given]
         found = [k for k in fields if k is not None]
-        return _Known(trace.program.words(), trace, found if len(found) == len(fields) else None)
+        return _Known(trace.program.checked(), trace, found if len(found) == len(fields) else None)
 
     def _trace(self, prepared: Prepared, shapes: Any) -> Trace:
         seen, *images = shapes

@@ -23,7 +23,7 @@ from darswin.deploy.own import (
     packed_weights,
     taken_by,
 )
-from darswin.deploy.program import RUN, Program, Weights
+from darswin.deploy.program import Checked, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import (
@@ -62,19 +62,18 @@ class OwnBlocks(PackedBlocks):
                 weights.offset(layer.words if isinstance(layer, OwnNorm) else layer)
 
     @cached_property
-    def words(self) -> list[int]:
+    def program(self) -> Checked:
         """The program of these blocks alone: a map and the position biases → the map."""
         program = Program(self.weights)
         x = program.input(*self.map_shape)
         tables = [program.input(*shape) for shape in self.table_shapes]
         program.output(program.blocks(x, self, tables))
-        return program.words()
+        return program.checked()
 
     def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
         if has_torch_function_unary(x):
             return handle_torch_function(OwnBlocks.__call__, (x,), self, x, tables)
-        words = self.words
-        return RUN([x, *tables], self.weights.words, words)[0]
+        return self.program([x, *tables])[0]
 
 
 class Own:

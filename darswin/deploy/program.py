@@ -1,9 +1,11 @@
 """Programs of networks: the instructions of csrc/core/network.h."""
 
 import struct
+import weakref
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -12,10 +14,12 @@ from torch import Tensor
 
 from darswin.deploy.own import OwnLinear, OwnNorm, PackedBlocks, own_operator, pack
 
-RUN = own_operator("_run")
+_NETWORK, _FORGET, _RUN = map(own_operator, ("_network", "_forget_network", "_run"))
 
-LINEAR, NORM, BLOCK, COPY, ADD, MEAN, GELU, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE = range(12)
-NOTHING, AND_GELU = range(2)  # what follows a product
+LINEAR, NORM, BLOCK, COPY, ADD, MEAN, APPLY, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE, POOL = range(
+    13
+)
+NOTHING, GELU, RELU = range(3)  # what follows a product
 COPY_AXES = 5
 
 
@@ -99,6 +103,22 @@ class Step:
     base: Slot | None = None
 
 
+class Checked:
+    """A program that is checked once, on its weights, (K,) int32: inputs → outputs.
+
+    Raises:
+        RuntimeError: the program does not fit its weights.
+    """
+
+    def __init__(self, weights: Tensor, words: Sequence[int]):
+        number = _NETWORK(weights, words)
+        self._run = partial(_RUN, network=number)
+        weakref.finalize(self, _FORGET, number)
+
+    def __call__(self, inputs: Sequence[Tensor]) -> list[Tensor]:
+        return self._run(inputs)
+
+
 class Program:
     """Instructions, written one after the other. Maps are channels last.
 
@@ -128,6 +148,10 @@ class Program:
         if not slot.is_buffer or slot.key in {output.key for output in self._outputs}:
             slot = self.permuted(slot, slot.shape, range(len(slot.shape)), *slot.shape)
         self._outputs.append(slot)
+
+    def checked(self) -> Checked:
+        """The program, ready to run."""
+        return Checked(self.weights.words, self.words())
 
     def words(self) -> list[int]:
         """The program as one array of integers."""
@@ -169,8 +193,8 @@ class Program:
             if base is not None and base.is_buffer and free:
                 place[step.out.key] = place.get(base.key, base.key)
                 before = made.get(base.key) if readers[base.key] == 1 else None
-                if step.opcode == GELU and before is not None and before.opcode == CONV:
-                    before.arguments = (*before.arguments[:-1], AND_GELU)
+                if step.opcode == APPLY and before is not None and before.opcode == CONV:
+                    before.arguments = (*before.arguments[:-1], step.arguments[-1])
                     continue
             elif base is not None and step.opcode != NORM:
                 steps.append(_copy(base, step.out, [(base.numbers, 1, 1)]))
@@ -254,10 +278,16 @@ class Program:
         out = self.buffer(x.shape[-1])
         return self._step(MEAN, out, [x], x, out, x.rows, x.shape[-1])
 
-    def gelu(self, x: Slot) -> Slot:
-        """The GELU."""
+    def apply(self, function: int, x: Slot) -> Slot:
+        """The GELU or the ReLU."""
         out = self.buffer(*x.shape)
-        return self._step(GELU, out, [x], out, base=x)
+        return self._step(APPLY, out, [x], out, function, base=x)
+
+    def pooled(self, x: Slot) -> Slot:
+        """The largest numbers of 2 × 2 pixels, also of fewer at the ends."""
+        height, width, channels = x.shape
+        out = self.buffer(-(-height // 2), -(-width // 2), channels)
+        return self._step(POOL, out, [x], x, out, height, width, channels)
 
     def conv(self, x: Slot, weight: Tensor, bias: Tensor | None) -> Slot:
         """A convolution of 3 × 3."""

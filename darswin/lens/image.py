@@ -93,7 +93,7 @@ class LensInImage(LensBatch):
 
     def _sizes(self, size: tuple[int, int]) -> Tensor:
         """One size for all lenses, (N, 2)."""
-        return self.theta_max.new_tensor([size]).expand(self.count, 2)
+        return tensor_there(size, self.theta_max).expand(self.count, 2)
 
     def in_picture(self, size: tuple[int, int]) -> Self:
         """The lens resized to a picture of (H, W); without an `image_size`, the lens itself.

@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch._higher_order_ops.while_loop import while_loop
 from torch.autograd import forward_ad
 
 from darswin.ops._library import transformed
 from darswin.ops.checks import readable
 
 Function = Callable[[Tensor], Tensor]
+State = tuple[Tensor, ...]
 
 _STEPS = 40  # Newton steps or bisections
 _TABLE = 1024  # entries of a table of the function
@@ -25,12 +28,12 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     order of the error, so derivatives up to the third are exact.
     """
     with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
-        eager = readable(value) and not transformed()
-        low, high, x = _brackets(function, value, end, eager)
+        low, high, x = _brackets(function, value, end)
         eps = torch.finfo(x.dtype).eps
         # After a Newton step of this length, x is exact to rounding.
-        moved, near = high - low, math.sqrt(eps) * end
-        for _ in range(min(_STEPS, 1 - round(math.log2(eps)))):  # more halvings change nothing
+        near = math.sqrt(eps) * end
+
+        def nearer(low: Tensor, high: Tensor, x: Tensor, moved: Tensor) -> State:
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
             step = error / slope(x)
@@ -38,21 +41,51 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
             fine = (newton >= low) & (newton <= high) & (2 * length <= moved)
             fine = fine | (length <= near)  # rounding may take it across an end of the bracket
             before, x = x, torch.where(fine, newton, (low + high) / 2)
-            moved = (x - before).abs()
-            if eager and not (moved > near).any():
-                break
+            return low, high, x, (x - before).abs()
+
+        rounds = min(_STEPS, 1 - round(math.log2(eps)))  # more halvings change nothing
+        start = low, high, x, high - low
+        _, _, x, _ = repeated(nearer, lambda *state: state[-1] > near, start, rounds)
     for _ in range(2):
         x = x - (function(x) - value) / slope(x)
     return x
 
 
-def _brackets(
-    function: Function, value: Tensor, end: Tensor, eager: bool
-) -> tuple[Tensor, Tensor, Tensor]:
+def repeated(
+    step: Callable[..., State], going: Callable[..., Tensor], state: State, rounds: int
+) -> State:
+    """The state after calls of `step(*state)`, which end after `rounds` or when `going(*state)` is
+    true nowhere. An exported graph has one loop for it."""
+    if torch.compiler.is_exporting():
+        start = torch.zeros((), dtype=torch.int64, device=state[0].device), *map(_dense, state)
+        return while_loop(
+            lambda count, *state: (count < rounds) & going(*state).any(),
+            lambda count, *state: (count + 1, *step(*state)),
+            start,
+        )[1:]
+    stops = _stops(state[0])
+    for _ in range(rounds):
+        state = step(*state)
+        if stops and not going(*state).any():
+            break
+    return state
+
+
+def _stops(value: Tensor) -> bool:
+    """Whether the number of steps may depend on values."""
+    return readable(value) and not transformed()
+
+
+def _dense(x: Tensor) -> Tensor:
+    """A copy in C order: the state of a loop keeps its strides."""
+    return x.clone(memory_format=torch.contiguous_format)
+
+
+def _brackets(function: Function, value: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Below and above the x of `inverse`, and a first guess of it."""
     high = torch.broadcast_tensors(end, value)[0]
     # The sizes come last: a graph would get a limit of them.
-    if not eager or end.dim() == 0 or high.numel() <= 4 * _TABLE * end.numel():
+    if not _stops(value) or end.dim() == 0 or high.numel() <= 4 * _TABLE * end.numel():
         return torch.zeros_like(high), high, high * (value / function(end)).clamp(0, 1)
     # With one end for many values, as for the pixels of an image: from a table.
     steps = torch.linspace(0, 1, _TABLE, dtype=end.dtype, device=end.device)
@@ -100,31 +133,36 @@ def newton(
         goal, point: (n, 2), or any shape if it is not `readable`.
         end: the largest distance from the origin.
     """
-    error = function(point) - goal
-    step, missed = solve(slopes(point), error), length_of(error)
-    part = torch.ones_like(missed)
-    shrinks = readable(point)  # otherwise shapes must not depend on values
-    if shrinks:
-        found, indices = point.clone(), torch.arange(len(point))
-    for _ in range(rounds):
+
+    def nearer(goal: Tensor, point: Tensor, step: Tensor, missed: Tensor, part: Tensor) -> State:
         trial = point - part[..., None] * step
         error, slope = function(trial) - goal, slopes(trial)
         better = (length_of(error) < missed) & (determinant(slope) > 0) & (length_of(trial) <= end)
         point = torch.where(better[..., None], trial, point)
         step = torch.where(better[..., None], solve(slope, error), step)
         missed = torch.where(better, length_of(error), missed)
-        part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if not shrinks:
-            continue
-        found[indices] = point
-        going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
-        going &= part > 1e-6
-        if not going.any():
-            return found
-        indices, goal, point, step, missed, part = (
-            x[going] for x in (indices, goal, point, step, missed, part)
-        )
-    return found if shrinks else point
+        return point, step, missed, torch.where(better, (2 * part).clamp(max=1), part / 4)
+
+    def going(goal: Tensor, missed: Tensor, part: Tensor) -> Tensor:
+        return (missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))) & (part > 1e-6)
+
+    error = function(point) - goal
+    missed = length_of(error)
+    state = point, solve(slopes(point), error), missed, torch.ones_like(missed)
+    if not readable(point):  # no shape depends on values
+        return repeated(
+            partial(nearer, goal), lambda *state: going(goal, *state[2:]), state, rounds
+        )[0]
+    found, indices = point.clone(), torch.arange(len(point))
+    for _ in range(rounds):
+        state = nearer(goal, *state)
+        found[indices] = state[0]
+        left = going(goal, *state[2:])
+        if not left.any():
+            break
+        indices, goal = indices[left], goal[left]
+        state = tuple(x[left] for x in state)
+    return found
 
 
 def length_of(points: Tensor) -> Tensor:

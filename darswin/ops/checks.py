@@ -76,8 +76,9 @@ def tensor_there(
     numbers: Sequence[float], like: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
     """A tensor (K,) of the numbers on the device of `like`. On a GPU the numbers are created
-    there, since the host would have to wait for a copy."""
-    if like.device.type == "cpu":
+    there, since the host would have to wait for a copy; in a graph too, as a loop has no constants
+    of its own."""
+    if readable(like):
         return like.new_tensor(numbers, dtype=dtype)
     made = [like.new_full((1,), number, dtype=dtype) for number in numbers]
     return torch.cat(made) if len(made) > 1 else made[0]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, ray_channels
+from darswin.lens.solve import repeated
 from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel, check_lens
@@ -187,7 +188,7 @@ class RayView(PixelView):
 
     def _turn(self, like: Tensor) -> Tensor:
         """The rotation (3, 3) from the view's frame to the camera's."""
-        return torch.tensor(self._frame, dtype=like.dtype, device=like.device)
+        return tensor_there([x for row in self._frame for x in row], like).reshape(3, 3)
 
     # -- what the view covers -----------------------------------------------------------------
 
@@ -250,13 +251,15 @@ class RayView(PixelView):
         def sees(share: Tensor) -> Tensor:
             return self._sees(lens, at(share), size)
 
+        def halved(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+            middle = (low + high) / 2
+            inside = sees(middle)
+            return torch.where(inside, middle, low), torch.where(inside, high, middle)
+
         # As a cumulative product, which ONNX lacks.
         count = ((~sees(shares[None, None])).int().cumsum(2) == 0).sum(2, keepdim=True)
         low, high = (shares[(count + k).clamp(0, _STEPS - 1)] for k in (-1, 0))
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            inside = sees(middle)
-            low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+        low, _ = repeated(halved, torch.less, (low, high), _BISECTIONS)
         return at(low)[:, :, 0]
 
     def _sees(self, lens: Lens, points: Tensor, size: Pair) -> Tensor:

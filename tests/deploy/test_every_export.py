@@ -8,9 +8,7 @@ from lens_examples import ASIDE, example
 from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import MODELS as LENS_MODELS
-from darswin.lens import distorted, solve
 from darswin.models import LensAdapter
-from darswin.views import directions
 
 SIDE = 16
 ONE = dict(embed_dim=8, depths=(1,), num_heads=(1,))
@@ -79,19 +77,6 @@ def lenses_of(name):
 GENERAL = [f"{name}, general" for name in ASIDE]
 # A closed inverse, one by Newton's method along the radius, and one in the plane.
 THREE = ("Spherical", "Polynomial", "KannalaBrandt, general")
-
-
-@pytest.fixture(autouse=True)
-def few_steps(monkeypatch):
-    # Each of Newton's steps is 40 nodes, or 120 in the plane; these lenses need few of them.
-    monkeypatch.setattr(solve, "_STEPS", 4)
-    monkeypatch.setattr(directions, "_BISECTIONS", 1)  # of the ends of what a lens sees
-    newton = solve.newton
-    monkeypatch.setattr(
-        distorted,
-        "newton",
-        lambda *given, rounds=60: newton(*given, rounds=rounds if rounds > 30 else 6),
-    )
 
 
 def check(kind, lens_name, written, input, fixed, path):

@@ -71,9 +71,7 @@ def tensors_of(lens):
         ("swin_unet_nano square", dict(ONE_BLOCK, image_size=32), SPHERICAL),
     ],
 )
-def test_program(name, options, lens, monkeypatch):
-    # Each of Newton's steps is 40 nodes; these radii need no more of them.
-    monkeypatch.setattr(solve, "_STEPS", 8)
+def test_program(name, options, lens):
     model = short(name, **options)
     program = export_program(model, *batch_of(lens, 1)[:2]).module()
     for count in (1, 2, 5):
