@@ -315,14 +315,18 @@ HOSTILE_STEPS = [
     ((3, 0, 1, 0, 0, 1, 1, 1, 1, 2, *[-1] * 5, *[1] * 5), "beyond"),
     ((4, 0, 0), "still reads|does not have"), ((4, 0, 2), "does not have"),
     ((5, 0, 1, MANY, 0), "out of range"), ((5, 0, 1, 0, 6), "out of range"),
-    ((6, 0), "does not have"), ((6, 2), "does not have"), ((6, -1), "does not have"),
+    ((6, 0, 1), "does not have"), ((6, 2, 1), "does not have"), ((6, -1, 1), "does not have"),
+    *(((6, 1, other), "unknown function") for other in (-1, 0, 3, 4)),
+    ((7, 0, 1, 2, 3, 1, 1, 0, 3), "unknown function|beyond its weights"),
     ((7, 0, 1, 2, 0, 1, 6, 0, 0), "out of range"), ((7, 0, 1, 2, 3, 1, 1, 0, 9), LAYER),
     ((7, 0, 1, 2, 3, 1, 1, 90, 0), LAYER), ((7, 0, 1, MANY, MANY, MANY, 6, 0, 0), "too large"),
     ((8, 0, 1, MANY, 0, 1, 6, 1), "out of range"), ((8, 0, 1, 2, 3, MANY, MANY, 0), "range"),
     ((9, 0, 1, 2, 3, 2, 3, 1, 0), "another size"), ((9, 0, 1, 0, 0, 2, 3, 1, 0), "out of range"),
     ((10, 0, 1, 0, 0, MANY, MANY, 6, 0), "out of range"), ((11, 0, 0), "does not have"),
-    ((12, 0), "unknown instruction"), ((-1, 0), "unknown instruction"), ((6,), "unknown"),
-    ((6, LARGE), "out of range"), ((6, -LARGE), "out of range"),
+    ((12, 0, 1, 2, 3, 1), "another size"), ((12, 0, 1, 0, 3, 1), "out of range"),
+    ((12, 0, 1, MANY, MANY, 1), "too large"), ((12, 1, 1, 2, 3, 1), "still reads"),
+    ((13, 0), "unknown instruction"), ((-1, 0), "unknown instruction"), ((6,), "unknown"),
+    ((6, LARGE, 1), "out of range"), ((6, -LARGE, 1), "out of range"),
 ]  # fmt: skip
 
 

@@ -36,8 +36,9 @@ LENSES = {
     "affine": Polynomial([26.0, -1.1], 1.6, [41.2, 30.3], affine=[[1.0, 0.02], [0.0, 0.9]]),
     "general": Mei(2.35, 80.0, [0.032, 2.4], 1.7, [40.3, 33.1], tangential=[6e-3, -3.5e-3]),
 }
-REFUSED = {"dat", "conv_unet"}
+REFUSED = {"dat"}
 FAMILIES = sorted({name.rpartition("_")[0] for name in list_models()} - REFUSED)
+UNETS = [name for name in FAMILIES if "unet" in name and name != "conv_unet"]
 CLASSIFIERS = [name for name in FAMILIES if "unet" not in name]
 CASES = [
     *((name, {}) for name in FAMILIES),
@@ -46,8 +47,10 @@ CASES = [
     ("darswin_a", dict(features_only=True, out_indices=(0, 2), output_fmt="NCHW")),
     ("swin", dict(features_only=True, out_indices=1)),
     *((name, dict(task="distance")) for name in FAMILIES if "unet" in name),
-    *((name, dict(skip_width=0, places=False, rays=False)) for name in FAMILIES if "unet" in name),
+    *((name, dict(skip_width=0, places=False, rays=False)) for name in UNETS),
     ("swin", dict(view=dict(name="perspective", reach=1.4))),
+    ("conv_unet", dict(rays=False, widths=(3, 5))),
+    ("conv_unet", dict(view=dict(name="mercator", size=(30, 50)), task="distance")),
     ("swin_unet", dict(view="square", task="distance")),
     ("swin_unet", dict(view="perspective", places=False)),
     ("darswin_unet_ra", dict(rays=True, num_classes=3)),
@@ -102,7 +105,7 @@ def quantized_of(model):
     return quantize_model(model, [(pictures, ROUND)])
 
 
-@pytest.mark.parametrize(("family", "own"), product([*FAMILIES, "maps"], [True, False]))
+@pytest.mark.parametrize(("family", "own"), product([*CLASSIFIERS, *UNETS, "maps"], [True, False]))
 def test_quantized_networks_compute_with_8_bits(family, own, tmp_path, monkeypatch):
     maps = dict(family="darswin_a", features_only=True)
     model = model_of(**maps if family == "maps" else dict(family=family))
@@ -157,7 +160,6 @@ def test_labels_and_normalization(tmp_path):
     ("model", "changes", "error", "words"),
     [
         (lambda: model_of("dat"), dict(size=(32, 32)), TypeError, "got DAT"),
-        (lambda: model_of("conv_unet"), {}, TypeError, "got ConvUnet"),
         (lambda: model_of().to(torch.bfloat16), {}, TypeError, "float32 weights, got .*bfloat16"),
         (lambda: model_of().double(), {}, TypeError, "float32 weights, got .*float64"),
         (lambda: LensAdapter(nn.Flatten(), 8, view="tiles", mean=0, std=1), {}, TypeError,

@@ -38,6 +38,7 @@ class _Bound(NamedTuple):
     shapes: Any
     known: _Known
     inputs: Sequence[Tensor]
+    learned: Sequence[Tensor]  # those of `prepared` that require gradients
 
 
 class Programs:
@@ -59,7 +60,7 @@ class Programs:
         self._known: dict[Any, _Known] = {}
         self._bound: dict[int, _Bound] = {}
         size = model.image_size or tuple(model.pretrained_cfg["input_size"][1:])
-        shapes = [of for of in (seen_by(model), _images(model, size)) if of is not None]
+        shapes = [of for of in (seen_by(model, size), _images(model, size)) if of is not None]
         with torch.no_grad():
             self._bind(_prepared_for_some_lens(model, layers, size), tuple(shapes))
 
@@ -75,6 +76,8 @@ class Programs:
         if bound is None or bound.shapes != shapes:
             bound = self._bind(prepared, shapes)
         known = bound.known
+        for learned in bound.learned:
+            refuse_gradients(learned)
         found = known.program([*given, *bound.inputs])
         results = zip(found, known.trace.results, strict=True)
         outputs = [output.permute(inverse(of.order)) for output, of in results]
@@ -94,7 +97,8 @@ class Programs:
             count = max(len(one) for one in leaves if isinstance(one, Tensor))
             each = [self._trace(_of_lens(read, k), shapes).given for k in range(count)]
             inputs = [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
-        bound = _Bound(prepared, shapes, known, inputs)
+        learned = [one for one in leaves if isinstance(one, Tensor) and one.requires_grad]
+        bound = _Bound(prepared, shapes, known, inputs, learned)
         kept = [*self._bound.items()][1 - _MOST :]
         self._bound = dict(kept) | {id(prepared): bound}  # a new one, for other threads
         return bound
@@ -148,8 +152,9 @@ def frame_program(model: Any, lens: Any, size: Pair) -> FrameProgram:
     prepared = _read(layers.prepare(lens, size))
     images = _images(model, size)
     trace = traced(
-        model, layers.forward_network, weights, seen_by(model), prepared, images, for_file=True
-    )
+        model, layers.forward_network, weights, seen_by(model, size), prepared, images,
+        for_file=True,
+    )  # fmt: skip
     words = trace.program.words()
     constants = [one.detach().float()[0].contiguous() for one in trace.given]
     classifies = isinstance(model, Encoder) and model.num_classes > 0
@@ -167,13 +172,12 @@ def _channels(model: Model) -> int:
     return model.in_chans
 
 
-def seen_by(model: Model) -> tuple[int, ...]:
-    """The shape of what the view sees of one image."""
+def seen_by(model: Model, size: Pair) -> tuple[int, ...]:
+    """The shape of what the view sees of one image of (H, W)."""
     view, channels = model.view, _channels(model)
     if isinstance(view, PolarView) and not view.in_pixels:
         return (*view.map_size, view.samples[0] * view.samples[1] * channels)
-    size = size_of(view) or model.image_size or model.pretrained_cfg["input_size"][1:]
-    return (channels, *size)
+    return (channels, *(size_of(view) or size))
 
 
 def _read(prepared: Prepared) -> Prepared:

@@ -62,13 +62,18 @@ class OwnBlocks(PackedBlocks):
                 weights.offset(layer.words if isinstance(layer, OwnNorm) else layer)
 
     @cached_property
-    def program(self) -> Checked:
+    def written(self) -> Program:
         """The program of these blocks alone: a map and the position biases → the map."""
         program = Program(self.weights)
         x = program.input(*self.map_shape)
         tables = [program.input(*shape) for shape in self.table_shapes]
         program.output(program.blocks(x, self, tables))
-        return program.checked()
+        return program
+
+    @cached_property
+    def program(self) -> Checked:
+        """`written`, ready to run."""
+        return self.written.checked()
 
     def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
         if has_torch_function_unary(x):

@@ -103,11 +103,12 @@ class Model(nn.Module, Generic[Result]):
             TypeError: the lens is missing, and the model uses one.
             ValueError: the lens belongs to images of another size.
         """
-        prepared = self.view.prepare(lens, size, back=self.goes_back)
+        view = self.view.for_lens(lens, size)
+        prepared = view.prepare(lens, size, back=self.goes_back)
         return Prepared(
             prepared,
-            rays=self.view.ray_channels(lens, size) if self.reads_rays else None,
-            tokens=[self.view.token_positions(lens, of_map) for of_map in self.token_maps],
+            rays=view.ray_channels(lens, size) if self.reads_rays else None,
+            tokens=[view.token_positions(lens, of_map) for of_map in self.token_maps],
             tables=[stage.tables(prepared.grid) for stage in self.stages],
         )
 

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -148,6 +148,10 @@ class View(nn.Module):
             channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
             per_channel("mean", mean, channels), per_channel("std", std, channels)
         self.mean, self.std = mean, std
+
+    def for_lens(self, lens: Lens | None, size: Pair) -> Self:
+        """The same view for these N lenses alone, which finds once what it covers."""
+        return self
 
     def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> Any:
         """Everything of N lenses that `see` and `back` need, a `PreparedPixels` or `PreparedPolar`.

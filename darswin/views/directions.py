@@ -13,7 +13,7 @@ from darswin.lens.pixels import as_map, ray_channels
 from darswin.lens.solve import repeated
 from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
-from darswin.views.base import Pair, PerChannel, check_lens
+from darswin.views.base import Pair, PerChannel, check_lens, in_full_precision
 from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
 from darswin.views.pixels import PixelView, check_supersampling
 
@@ -95,10 +95,11 @@ class RayView(PixelView):
             fov = cls.widest if cls.around else min(across, cls.usual_fov)
         return fov, size[0] / size[1] if cls.aspect is None else cls.aspect
 
-    def for_lens(self, lens: Lens, size: Pair) -> Self:
-        # What the view covers takes most of the time of `to_view`.
-        view = copy.copy(self)
-        view._known = self._layout(lens, size)
+    @in_full_precision
+    def for_lens(self, lens: Lens | None, size: Pair) -> Self:
+        # What the view covers takes most of the time of `to_view`. Dynamo cannot copy.
+        view = self if torch.compiler.is_dynamo_compiling() else copy.copy(self)
+        view._known = self._layout(check_lens(lens, size), size)
         return view
 
     def to_plane(self, rays: Tensor) -> Tensor:

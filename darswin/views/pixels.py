@@ -1,7 +1,7 @@
 """The views that a network sees as pixels, and the way from their pixels back to the images."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -105,10 +105,6 @@ class PixelView(View):
         return grid if supersampling == 1 else (grid + 0.5) / supersampling - 0.5
 
     # -- of one lens: what `Remap` asks for -----------------------------------------------------
-
-    def for_lens(self, lens: Lens, size: Pair) -> Self:
-        """The same view of this lens alone, which finds once what it covers."""
-        return self
 
     def camera(self, lens: Any, size: Pair) -> Lens | None:
         """The lens of the view's picture, if a camera could have taken it."""

@@ -8,7 +8,7 @@ from torch import nn
 
 from darswin import optimize
 from darswin.deploy.own import OwnLinear, OwnNorm, packed_weights
-from darswin.deploy.program import RUN, NoProgramError, Weights
+from darswin.deploy.program import NoProgramError, Weights
 from darswin.deploy.record import inverse, traced
 from darswin.lens import Spherical
 from darswin.lens.pixels import sample_at
@@ -24,7 +24,7 @@ def run(forward, *images, for_file=False):
     if more and for_file:
         inputs[1] = more[0].permute(0, 2, 3, 1).contiguous()
     given = [one.expand(len(x), *one.shape[1:]).contiguous() for one in trace.given]
-    found = RUN([*inputs, *given], weights.words, trace.program.words())
+    found = trace.program.checked()([*inputs, *given])
     pairs = zip(found, trace.results, strict=True)
     found = [one.permute(inverse(of.order)) for one, of in pairs]
     return found if trace.is_list else found[0]
@@ -79,6 +79,10 @@ IMAGES = {  # functions of images (1, 3, 4, 6)
     "conv and gelu": lambda x: F.gelu(CONV(x)),
     "conv that is read twice": lambda x: F.gelu(y := CONV(x)) + y,
     "conv that is read before its gelu": lambda x: ((y := CONV(x)) + y) + F.gelu(y),
+    "conv and relu": lambda x: F.relu(CONV(x)),
+    "conv and two functions": lambda x: F.relu(F.gelu(CONV(x))),
+    "relu": lambda x: F.relu(x),
+    "pooled": lambda x: F.max_pool2d(F.max_pool2d(CONV(x), 2, ceil_mode=True), 2, ceil_mode=True),
     "convs": lambda x: (y := F.gelu(CONV(x))) + F.gelu(CONV2(y)),
     "conv of two": lambda x: CONV(torch.cat((x[:, 1:], x[:, :1]), 1)),
     "resized": lambda x: F.interpolate(x, (7, 3), mode="bilinear"),
@@ -137,6 +141,8 @@ class Refused(nn.Module):
         (lambda x: F.conv2d(x, torch.ones(1, 3, 1, 1)), "convolution of 1 × 1"),
         (lambda x: F.interpolate(x, (2, 2), mode="nearest"), "this interpolation, nearest"),
         (lambda x: x + torch.ones(3, 1, 1), "a sum of values of other shapes"),
+        (lambda x: F.relu(x, inplace=True), "a ReLU in place"),
+        (lambda x: F.max_pool2d(x, 2), "this pooling"),
         (lambda x: x.mean(3), r"a mean over the axes"),
         (lambda x: F.linear(x, torch.ones(2, 6)), "linear is no instruction"),
         (lambda x: torch.where(x > 0, x, 0.0), "is no instruction"),

@@ -10,7 +10,7 @@ from torch import nn
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import Own, OwnBlocks
-from darswin.deploy.program import BLOCK, RUN, Weights
+from darswin.deploy.program import BLOCK, Checked, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
@@ -210,7 +210,8 @@ def test_blocks_that_do_not_fit():
     blocks = OwnBlocks(stage(depth=1), Weights())
     table, x = torch.zeros(1, *blocks.table_shapes[0]), torch.zeros(1, *blocks.map_shape)
     blocks(x, [table])
-    words, weights = blocks.words, blocks.weights.words
+    words, weights = blocks.written.words(), blocks.weights.words
+    run = Checked(weights, words)
     assert words[-25] == BLOCK and (blocks.heads, blocks.mlp_dim) == (3, 60)
     wrong = {1: (9, 0), 2: (0,), 3: (20,), 4: (0, -3, 5), 5: (0, 2**61), 6: (-1, 2**40),
              7: (-1, weights.numel()), 8: (2,), 16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,),
@@ -220,7 +221,7 @@ def test_blocks_that_do_not_fit():
             changed = [*words]
             changed[place - 23] = value
             with pytest.raises(ValueError, match="the program of a network"):
-                RUN([x, table], weights, changed)
+                Checked(weights, changed)
     for given in ([x], [x[..., :20], table], [x, table[:, :2]], [x.transpose(1, 2)[:, :1], table]):
         with pytest.raises(RuntimeError, match="_run"):
-            RUN(given, weights, words)
+            run(given)

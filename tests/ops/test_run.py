@@ -1,6 +1,10 @@
-"""`_run`: whole networks as one operator. test_frame_networks.py compares results with models."""
+"""`_network` and `_run`: whole networks as one operator. test_frame_networks.py compares results with
+models."""
 
 import math
+import multiprocessing
+import sys
+from multiprocessing.pool import ThreadPool
 
 import pytest
 import torch
@@ -8,10 +12,11 @@ from helpers import network
 
 from darswin import optimize
 from darswin.deploy.networks import frame_program
-from darswin.deploy.program import Program, Weights
+from darswin.deploy.program import Checked, Program, Weights
 from darswin.lens import Spherical
 
-_run = torch.ops.darswin._run
+
+CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
 def given(name="darswin_a_nano", **options):
@@ -48,7 +53,7 @@ def test_wrong_programs_are_refused_or_run(name):
         if drawn(5) == 0:
             changed = changed[: drawn(len(changed))]
         try:
-            _run(inputs, weights, changed)
+            Checked(weights, changed)(inputs)
         except (ValueError, RuntimeError, MemoryError):
             refused += 1
     assert refused > 200  # most words matter
@@ -63,22 +68,61 @@ BLOCK = (1, 2**10, 2**10, 1, 1, 4096, *[0] * 10, 1, 1, 0, 0, 0, 0, 0)  # 2**20 t
 def test_a_small_program_cannot_ask_for_all_memory(words):
     weights = torch.zeros(2**17, dtype=torch.int32)
     with pytest.raises((RuntimeError, ValueError), match="more memory than its inputs"):
-        _run([torch.zeros(1, words[1])], weights, words)
+        Checked(weights, words)
 
 
 def test_wrong_inputs_are_refused():
     inputs, weights, words = given()
     x, *tables = inputs
+    run = Checked(weights, words)
     for changed in (
         [x], [x[0], *tables], [x.double(), *tables], [x.to("meta"), *tables],
         [torch.zeros(2, *x.shape[1:]), *(torch.cat([t] * 3) for t in tables)], [],
     ):  # fmt: skip
         with pytest.raises((RuntimeError, NotImplementedError), match="_run"):
-            _run(changed, weights, words)
+            run(changed)
     for changed in (weights.float(), weights[::2], weights[:-1]):
         with pytest.raises((RuntimeError, ValueError), match="weights"):
-            _run(inputs, changed, words)
-    assert _run([x[:0], *tables], weights, words)[0].shape == (0, 5)
+            Checked(changed, words)
+    assert run([x[:0], *tables])[0].shape == (0, 5)
+
+
+def test_a_network_is_kept_until_its_program_ends():
+    inputs, weights, words = given()
+    number = torch.ops.darswin._network(weights, words)
+    other, run = Checked(weights.clone(), words), torch.ops.darswin._run
+    expected = run(inputs, number)
+    del weights  # the network keeps them
+    assert torch.equal(other(inputs)[0], expected[0])
+    torch.ops.darswin._forget_network.default.redispatch(CPU, number)
+    for wrong in (number, -1, 2**16, 2**62):
+        with pytest.raises(RuntimeError, match="there is no such network"):
+            run(inputs, wrong)
+        torch.ops.darswin._forget_network.default.redispatch(CPU, wrong)  # which does nothing
+    taken = other._run.keywords["network"]
+    del other
+    with pytest.raises(RuntimeError, match="there is no such network"):
+        run(inputs, taken)
+
+
+def test_networks_survive_threads_and_forks():
+    inputs, weights, words = given()
+    program, many = Checked(weights, words), ThreadPool(4)
+    expected = program(inputs)[0]
+
+    def made_and_run(_):
+        return torch.equal(Checked(weights, words)(inputs)[0], expected)
+
+    assert all(many.map(made_and_run, range(40)))
+
+    def in_child():
+        again = Checked(weights, words)(inputs)[0]
+        sys.exit(not (torch.equal(program(inputs)[0], expected) and torch.equal(again, expected)))
+
+    child = multiprocessing.get_context("fork").Process(target=in_child)
+    child.start()
+    child.join(60)
+    assert child.exitcode == 0
 
 
 def test_numbers_that_are_copied_and_changed():
@@ -89,7 +133,7 @@ def test_numbers_that_are_copied_and_changed():
     program.output(program.mean(x))
     program.output(program.resized(x, (5, 3)))
     numbers = torch.randn(2, 2, 6, 4)
-    got = _run([numbers], torch.zeros(0, dtype=torch.int32), program.words())
+    got = program.checked()([numbers])
     permuted = numbers.view(2, 2, 3, 2, 4).permute(0, 2, 1, 4, 3).reshape(2, 3, 2, 8)
     first = numbers.permute(0, 3, 1, 2)
     resized = torch.nn.functional.interpolate(first, (5, 3), mode="bilinear").permute(0, 2, 3, 1)
