@@ -163,8 +163,10 @@ def _program(
             dynamic_shapes=dict.fromkeys((*pixels, *tensors), batch),
             strict=False,  # it takes half of the time of a strict export
         )
-        _join_equal_nodes(program.graph)
-        program.graph_module.recompile()
+        for graph in program.graph_module.modules():  # its own, and those of its loops
+            if isinstance(graph, torch.fx.GraphModule):
+                _join_equal_nodes(graph.graph)
+                graph.recompile()
     return program
 
 

@@ -4,8 +4,9 @@ back from a polar map to pixels.
 Rings and samples are equal steps of a *spacing*; see `darswin.lens.spacing`.
 """
 
+import copy
 import math
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -80,6 +81,8 @@ class PolarView(View):
 
     coordinates = 3  # the viewing direction of a token
 
+    _found: list[tuple[Tensor, Tensor]] | None = None  # by `_pixel_rays`
+
     def __init__(
         self,
         rings: int = 16,
@@ -119,6 +122,13 @@ class PolarView(View):
         self.jitter = check_jitter(jitter)
         self.in_pixels = layout == "image"
 
+    def for_lens(self, lens: Lens | None, size: Pair) -> Self:
+        if torch.compiler.is_dynamo_compiling():
+            return self  # as Dynamo cannot copy
+        view = copy.copy(self)
+        view._found = []
+        return view
+
     @in_full_precision
     def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> PreparedPolar:
         lens = check_lens(lens, size)
@@ -133,7 +143,14 @@ class PolarView(View):
         lens = check_lens(lens, size)
         if self.in_pixels:
             return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
-        return ray_channels(*pixel_rays(lens, size))
+        return ray_channels(*self._pixel_rays(lens, size))
+
+    def _pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        """`pixel_rays`, which takes long for a lens that is not radial: once for `for_lens`."""
+        found = [] if self._found is None else self._found
+        if not found:
+            found.append(pixel_rays(lens, size))
+        return found[0]
 
     @in_full_precision
     def token_positions(self, lens: Lens | None, size: Pair) -> Tensor:
@@ -261,7 +278,7 @@ class PolarView(View):
         if lens.is_radial:
             grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
         else:
-            theta, direction = pixel_rays(lens, image_size)
+            theta, direction = self._pixel_rays(lens, image_size)
             seen = ~theta.isnan()  # NaN would spread to the gradients
             flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
             points = torch.where(seen[..., None], flat, torch.nan)
