@@ -19,6 +19,7 @@ namespace {
 // size, in the caches.
 constexpr int64_t kPartBytes = int64_t{16} << 20;
 constexpr double kCopiesPerMicrosecond = 2000;  // numbers
+constexpr int64_t kChunk = 4096;                // numbers that a thread takes at once
 
 // Calls body(begin, end) on ranges of items that cost so many numbers each.
 template <typename Body>
@@ -108,25 +109,52 @@ struct Network::Run {
 
   void copy(const int64_t* a) const {
     const int64_t *sizes = a + 4, *reads = sizes + kCopyAxes, *writes = reads + kCopyAxes;
-    const int64_t inner = sizes[1] * sizes[2] * sizes[3] * sizes[4];
-    share(batch * sizes[0], inner, [&](int64_t begin, int64_t end) {
-      for (int64_t item = begin; item < end; ++item) {
-        const int64_t b = item / sizes[0], i = item % sizes[0];
-        const float* source = image(a[0], b) + a[2] + i * reads[0];
-        float* target = result(a[1], b) + a[3] + i * writes[0];
-        for (int64_t j = 0; j < sizes[1]; ++j) {
-          for (int64_t k = 0; k < sizes[2]; ++k) {
-            for (int64_t l = 0; l < sizes[3]; ++l) {
-              const float* x = source + j * reads[1] + k * reads[2] + l * reads[3];
-              float* y = target + j * writes[1] + k * writes[2] + l * writes[3];
-              if (reads[4] == 1 && writes[4] == 1) {
-                std::memcpy(y, x, sizes[4] * sizeof(float));
-              } else {
-                for (int64_t m = 0; m < sizes[4]; ++m) y[m * writes[4]] = x[m * reads[4]];
-              }
-            }
+    const int64_t rows = sizes[0] * sizes[1] * sizes[2] * sizes[3],
+                  most = rows == 1 ? kChunk : sizes[4];
+    const int64_t parts = units(sizes[4], most);
+    share(batch * rows * parts, most, [&](int64_t begin, int64_t end) {
+      for (int64_t item = begin; item < end;) {
+        const int64_t b = item / (rows * parts), part = item % parts;
+        const float* source = image(a[0], b) + a[2] + part * most * reads[4];
+        float* target = result(a[1], b) + a[3] + part * most * writes[4];
+        const int64_t count = std::min(most, sizes[4] - part * most);
+        int64_t rest = item / parts % rows, at[4];
+        for (int axis = 3; axis >= 0; --axis) {
+          at[axis] = rest % sizes[axis];
+          rest /= sizes[axis];
+          source += at[axis] * reads[axis], target += at[axis] * writes[axis];
+        }
+        // The rows of this image follow each other.
+        bool same_image = true;
+        while (same_image && item < end) {
+          if (reads[4] == 1 && writes[4] == 1) {
+            std::memcpy(target, source, count * sizeof(float));
+          } else {
+            for (int64_t k = 0; k < count; ++k) target[k * writes[4]] = source[k * reads[4]];
+          }
+          ++item;
+          same_image = false;
+          for (int axis = 3; axis >= 0 && !same_image; --axis) {
+            source += reads[axis], target += writes[axis];
+            same_image = ++at[axis] < sizes[axis];
+            if (same_image) break;
+            source -= sizes[axis] * reads[axis], target -= sizes[axis] * writes[axis];
+            at[axis] = 0;
           }
         }
+      }
+    });
+  }
+
+  // Adds the numbers of a slot to those of another.
+  void add(const int64_t* a) const {
+    const int64_t count = numbers(a[1]), parts = units(count, kChunk);
+    const auto& kernel = kernels<ElementKernels>();
+    share(batch * parts, kChunk, [&](int64_t begin, int64_t end) {
+      for (int64_t item = begin; item < end; ++item) {
+        const int64_t b = item / parts, first = item % parts * kChunk;
+        kernel.add(image(a[0], b) + first, result(a[1], b) + first,
+                   std::min(kChunk, count - first));
       }
     });
   }
@@ -151,10 +179,10 @@ struct Network::Run {
     });
   }
 
-  // Collects the 3 x 3 neighbours of some pixels, and multiplies them as a linear layer. The threads
-  // share the columns too if there are few pixels.
+  // Collects the 3 x 3 neighbours of some pixels, and multiplies them as a linear layer. The
+  // threads share the columns too if there are few pixels.
   void conv(const Step& step) const {
-    constexpr int64_t kPixels = 64;  // whose neighbours stay in the cache
+    constexpr int64_t kPixels = 64;          // whose neighbours stay in the cache
     constexpr double kPerMicrosecond = 5e4;  // multiply-adds
     const int64_t* a = step.arguments;
     const int64_t pixels = batch * a[2] * a[3], depth = step.layer.depth;
@@ -164,24 +192,23 @@ struct Network::Run {
     const int64_t chunks = units(pixels, kPixels);
     const int64_t parts = std::min(units(threads, chunks), panels);
     const auto& kernel = kernels<LinearKernels<float>>().rows;
-    run_with_scratch(
-        chunks * parts, threads, kPixels * depth * static_cast<int64_t>(sizeof(float)),
-        [&](int64_t begin, int64_t end, void* memory) {
-          auto* tokens = static_cast<float*>(memory);
-          for (int64_t item = begin; item < end; ++item) {
-            const int64_t first = item / parts * kPixels, part = item % parts;
-            const int64_t count = std::min(kPixels, pixels - first);
-            if (item == begin || part == 0) neighbours(a, first, count, tokens);
-            const LinearArgs<float> args{.x = tokens,
-                                         .packed = step.layer.packed,
-                                         .rows = count,
-                                         .depth = depth,
-                                         .columns = columns,
-                                         .after = static_cast<After>(a[7]),
-                                         .out = to[a[1]] + first * columns};
-            kernel(args, 0, count, panels * part / parts, panels * (part + 1) / parts);
-          }
-        });
+    run_with_scratch(chunks * parts, threads, kPixels * depth * static_cast<int64_t>(sizeof(float)),
+                     [&](int64_t begin, int64_t end, void* memory) {
+                       auto* tokens = static_cast<float*>(memory);
+                       for (int64_t item = begin; item < end; ++item) {
+                         const int64_t first = item / parts * kPixels, part = item % parts;
+                         const int64_t count = std::min(kPixels, pixels - first);
+                         if (item == begin || part == 0) neighbours(a, first, count, tokens);
+                         const LinearArgs<float> args{.x = tokens,
+                                                      .packed = step.layer.packed,
+                                                      .rows = count,
+                                                      .depth = depth,
+                                                      .columns = columns,
+                                                      .after = static_cast<After>(a[7]),
+                                                      .out = to[a[1]] + first * columns};
+                         kernel(args, 0, count, panels * part / parts, panels * (part + 1) / parts);
+                       }
+                     });
   }
   // Writes the neighbours of pixels [first, first + count) of all images.
   void neighbours(const int64_t* a, int64_t first, int64_t count, float* to) const {
@@ -294,7 +321,6 @@ struct Network::Run {
   // Applies a function of numbers to a slot, in place.
   template <typename Apply>
   void each(int64_t slot, Apply apply) const {
-    constexpr int64_t kChunk = 4096;
     const int64_t count = batch * numbers(slot);
     share(units(count, kChunk), 4 * kChunk, [&](int64_t begin, int64_t end) {
       apply(to[slot] + begin * kChunk, std::min(end * kChunk, count) - begin * kChunk);
@@ -314,9 +340,7 @@ struct Network::Run {
       case Opcode::copy:
         return copy(a);
       case Opcode::add:
-        for (int64_t b = 0; b < batch; ++b)
-          kernel.add(image(a[0], b), result(a[1], b), numbers(a[1]));
-        return;
+        return add(a);
       case Opcode::mean:
         return mean(a);
       case Opcode::apply:

@@ -154,8 +154,10 @@ struct Panel {
     each_register<kRows, kWide>(
         [&](int i, int v) { result[i][v] = value(sum[i][v], first + n + v * kL); });
     const int64_t left = a.columns - first - n, place = row * a.columns + first + n;
-    if (a.quantized != nullptr || a.after == After::gelu || a.after == After::relu ||
-        left < kWide * kL) {
+    if (a.after == After::relu) {
+      each_register<kRows, kWide>([&](int i, int v) { result[i][v] = relu(result[i][v]); });
+    }
+    if (a.quantized != nullptr || a.after == After::gelu || left < kWide * kL) {
       Floats copy[kRows][kWide];  // lets the result itself stay in registers
       each_register<kRows, kWide>([&](int i, int v) { copy[i][v] = result[i][v]; });
       finish<kRows, kWide>(copy, place, left);
@@ -197,9 +199,7 @@ struct Panel {
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
         const int64_t to = place + i * columns + v * kL, count = smaller(kL, left - v * kL);
-        const Floats result = after == After::gelu   ? gelu(tile[i][v])
-                              : after == After::relu ? relu(tile[i][v])
-                                                     : tile[i][v];
+        const Floats result = after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
         if (count < kL || after == After::add) {
           float lanes[kL];
           store(lanes, result);

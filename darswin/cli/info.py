@@ -8,10 +8,12 @@ from pathlib import Path
 import torch
 
 from darswin.deploy.packed import fastest_dtype, has_own_int8
+from darswin.deploy.optimize import optimize
 from darswin.layers.linear import onednn_lack
-from darswin.models import list_models
+from darswin.layers.quantized import quantized_layers
+from darswin.models import create_model, list_models
 from darswin.models.registry import list_pretrained
-from darswin.models.saving import read_card
+from darswin.models.saving import load_model, read_card
 from darswin.ops import _module, cpu_capability
 from darswin.utils import extras
 
@@ -31,10 +33,25 @@ def models() -> None:
         )
 
 
-def info() -> None:
-    """Prints the details of this installation and machine to include in a bug report."""
-    for name, value in facts().items():
+def info(*, model: str | None = None) -> None:
+    """Prints the details of this installation and machine to include in a bug report.
+
+    Args:
+        model: a name that `darswin models` lists, or a file of weights, to print how
+            `darswin.optimize` runs that model on this machine.
+    """
+    lines = facts()
+    if model is not None:
+        lines["model"] = f"{model}: {way_of(model)}"
+    for name, value in lines.items():
         print(f"{name:<10}{value}")
+
+
+def way_of(name: str) -> str:
+    """How `optimize` runs a model: as one program, or layer by layer because of a part."""
+    model = create_model(name) if name in list_models() else load_model(name)[0]
+    dtype = torch.int8 if quantized_layers(model) else torch.float32
+    return optimize(model.eval(), dtype).lack or "one program"
 
 
 def facts() -> dict[str, str]:

@@ -24,6 +24,18 @@ def test_facts_of_this_machine(capsys):
     assert all(lines[f"[{extra}]"] == "installed" for extra in EXTRAS)
 
 
+@pytest.mark.parametrize(
+    ("model", "way"),
+    [
+        ("darswin_a_nano", "one program"), ("conv_unet_nano", "one program"),
+        ("digits", "one program"), ("dat_nano", "layer by layer, because of stages."),
+    ],
+)  # fmt: skip
+def test_how_a_model_runs(model, way, capsys):
+    main(["info", "--model", model])
+    assert capsys.readouterr().out.splitlines()[-1].startswith(f"model     {model}: {way}")
+
+
 def test_what_is_missing_and_why_onednn_is_not_used(monkeypatch):
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(EXTRAS) == declared["optional-dependencies"].keys()
