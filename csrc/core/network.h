@@ -32,7 +32,7 @@ enum class Opcode : int64_t {
   sample,    // x, out, H, W, H', W', channels, points (H', W', 2): bilinear, zeros outside
   to_image,  // x, out, R, A, channels, H, W, plan: polar_to_image
   distance,  // x, in place, typical distance as the bits of a float
-  pool,      // x, out, H, W, channels: the largest numbers of 2 x 2 pixels, also of fewer at the ends
+  pool,      // x, out, H, W, channels: the largest of 2 x 2 pixels, also of fewer at the ends
 };
 
 constexpr int64_t kCopyAxes = 5;

@@ -109,44 +109,30 @@ struct Network::Run {
 
   void copy(const int64_t* a) const {
     const int64_t *sizes = a + 4, *reads = sizes + kCopyAxes, *writes = reads + kCopyAxes;
-    const int64_t rows = sizes[0] * sizes[1] * sizes[2] * sizes[3],
-                  most = rows == 1 ? kChunk : sizes[4];
-    const int64_t parts = units(sizes[4], most);
+    const int64_t rows = sizes[0] * sizes[1] * sizes[2] * sizes[3];
+    const int64_t most = rows == 1 ? kChunk : sizes[4], parts = units(sizes[4], most);
     share(batch * rows * parts, most, [&](int64_t begin, int64_t end) {
-      for (int64_t item = begin; item < end;) {
-        const int64_t b = item / (rows * parts), part = item % parts;
-        const float* source = image(a[0], b) + a[2] + part * most * reads[4];
-        float* target = result(a[1], b) + a[3] + part * most * writes[4];
-        const int64_t count = std::min(most, sizes[4] - part * most);
-        int64_t rest = item / parts % rows, at[4];
+      for (int64_t item = begin; item < end; ++item) {
+        const int64_t b = item / (rows * parts), first = item % parts * most;
+        const int64_t count = std::min(most, sizes[4] - first);
+        const float* source = image(a[0], b) + a[2] + first * reads[4];
+        float* target = result(a[1], b) + a[3] + first * writes[4];
+        int64_t row = item / parts % rows;
         for (int axis = 3; axis >= 0; --axis) {
-          at[axis] = rest % sizes[axis];
-          rest /= sizes[axis];
-          source += at[axis] * reads[axis], target += at[axis] * writes[axis];
+          if (sizes[axis] == 1) continue;
+          const int64_t k = row % sizes[axis];
+          row /= sizes[axis];
+          source += k * reads[axis], target += k * writes[axis];
         }
-        // The rows of this image follow each other.
-        bool same_image = true;
-        while (same_image && item < end) {
-          if (reads[4] == 1 && writes[4] == 1) {
-            std::memcpy(target, source, count * sizeof(float));
-          } else {
-            for (int64_t k = 0; k < count; ++k) target[k * writes[4]] = source[k * reads[4]];
-          }
-          ++item;
-          same_image = false;
-          for (int axis = 3; axis >= 0 && !same_image; --axis) {
-            source += reads[axis], target += writes[axis];
-            same_image = ++at[axis] < sizes[axis];
-            if (same_image) break;
-            source -= sizes[axis] * reads[axis], target -= sizes[axis] * writes[axis];
-            at[axis] = 0;
-          }
+        if (reads[4] == 1 && writes[4] == 1) {
+          std::memcpy(target, source, count * sizeof(float));
+        } else {
+          for (int64_t k = 0; k < count; ++k) target[k * writes[4]] = source[k * reads[4]];
         }
       }
     });
   }
 
-  // Adds the numbers of a slot to those of another.
   void add(const int64_t* a) const {
     const int64_t count = numbers(a[1]), parts = units(count, kChunk);
     const auto& kernel = kernels<ElementKernels>();

@@ -4,11 +4,12 @@ import platform
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.deploy.optimize import optimize
+from darswin.deploy.packed import fastest_dtype, has_own_int8
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.models import create_model, list_models
@@ -51,7 +52,8 @@ def way_of(name: str) -> str:
     """How `optimize` runs a model: as one program, or layer by layer because of a part."""
     model = create_model(name) if name in list_models() else load_model(name)[0]
     dtype = torch.int8 if quantized_layers(model) else torch.float32
-    return optimize(model.eval(), dtype).lack or "one program"
+    fast: Any = optimize(model.eval(), dtype)
+    return fast.lack or "one program"
 
 
 def facts() -> dict[str, str]:

@@ -148,7 +148,7 @@ def newton(
 
     error = function(point) - goal
     missed = length_of(error)
-    state = point, solve(slopes(point), error), missed, torch.ones_like(missed)
+    state: State = point, solve(slopes(point), error), missed, torch.ones_like(missed)
     if not readable(point):  # no shape depends on values
         return repeated(
             partial(nearer, goal), lambda *state: going(goal, *state[2:]), state, rounds

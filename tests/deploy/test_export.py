@@ -19,7 +19,7 @@ from darswin.deploy.export import (
     export_program,
 )
 from darswin.layers.transformer import Block
-from darswin.lens import Mei, Polynomial, Spherical, solve
+from darswin.lens import Mei, Polynomial, Spherical
 from darswin.models.unet import Unet
 from darswin.ops import _module
 

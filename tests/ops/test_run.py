@@ -1,5 +1,7 @@
-"""`_network` and `_run`: whole networks as one operator. test_frame_networks.py compares results with
-models."""
+"""`_network` and `_run`: whole networks as one operator.
+
+test_frame_networks.py compares results with models.
+"""
 
 import math
 import multiprocessing
@@ -14,7 +16,6 @@ from darswin import optimize
 from darswin.deploy.networks import frame_program
 from darswin.deploy.program import Checked, Program, Weights
 from darswin.lens import Spherical
-
 
 CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
