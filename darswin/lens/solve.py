@@ -17,6 +17,7 @@ State = tuple[Tensor, ...]
 
 _STEPS = 40  # Newton steps or bisections
 _TABLE = 1024  # entries of a table of the function
+_HAS_LOOPS = torch.__version__ >= (2, 12)  # torch.onnx of 2.10 cannot translate a loop
 
 
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
@@ -55,8 +56,8 @@ def repeated(
     step: Callable[..., State], going: Callable[..., Tensor], state: State, rounds: int
 ) -> State:
     """The state after calls of `step(*state)`, which end after `rounds` or when `going(*state)` is
-    true nowhere. An exported graph has one loop for it."""
-    if torch.compiler.is_exporting():
+    true nowhere. An exported graph has one loop for it, if torch can write that."""
+    if _HAS_LOOPS and torch.compiler.is_exporting():
         start = torch.zeros((), dtype=torch.int64, device=state[0].device), *map(_dense, state)
         return while_loop(
             lambda count, *state: (count < rounds) & going(*state).any(),

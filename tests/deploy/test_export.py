@@ -19,7 +19,7 @@ from darswin.deploy.export import (
     export_program,
 )
 from darswin.layers.transformer import Block
-from darswin.lens import Mei, Polynomial, Spherical
+from darswin.lens import Mei, Polynomial, Spherical, solve
 from darswin.models.unet import Unet
 from darswin.ops import _module
 
@@ -230,10 +230,17 @@ def test_a_fixed_lens_is_solved_before_the_graph_begins(translated):
 
 
 @pytest.mark.slow
-def test_the_nodes_that_solve_for_the_rays_of_pixels():
-    # Each of Newton's steps is 40 nodes.
-    model, images = short("conv_unet_nano", widths=(4,)), torch.zeros(1, 3, 32, 32)
-    assert len(export_program(model, images, POLYNOMIAL[:1]).graph.nodes) <= 1250
+@pytest.mark.parametrize("loops", [True, False])
+def test_the_nodes_that_solve_for_the_rays_of_pixels(loops, monkeypatch):
+    model, (images, lens, tensors) = (
+        short("conv_unet_nano", widths=(4,)), batch_of(POLYNOMIAL, 1)
+    )  # fmt: skip
+    monkeypatch.setattr(solve, "_HAS_LOOPS", loops)
+    monkeypatch.setattr(solve, "_STEPS", 40 if loops else 8)  # each of Newton's steps is 40 nodes
+    program = export_program(model, images, lens)
+    assert loops == any("while_loop" in node.name for node in program.graph.nodes)
+    assert len(program.graph.nodes) <= (320 if loops else 600)
+    torch.testing.assert_close(program.module()(images, **tensors), model(images, lens))
 
 
 @pytest.mark.slow
