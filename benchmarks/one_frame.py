@@ -52,6 +52,7 @@ MODELS = {
     "darswin_a_micro": (64, {ONNX_RUNTIME: 1.1}),
     "darswin_a_small": (64, {ONNX_RUNTIME: 1.1}),
     "darswin_unet_a_nano": (128, {ONNX_RUNTIME: 1.5}),
+    "conv_unet_nano": (128, {ONNX_RUNTIME: 1.0}),
 }
 # The least ratios of a sampler and ONNX Runtime to `darswin.frames.Network`, on one thread.
 FROM_FRAME = {"darswin_a_nano": 1 / 0.6, "darswin_a_micro": 1 / 0.75}

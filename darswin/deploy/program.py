@@ -107,7 +107,7 @@ class Checked:
     """A program that is checked once, on its weights, (K,) int32: inputs → outputs.
 
     Raises:
-        RuntimeError: the program does not fit its weights.
+        ValueError: the program does not fit its weights.
     """
 
     def __init__(self, weights: Tensor, words: Sequence[int]):
