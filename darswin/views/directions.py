@@ -97,8 +97,10 @@ class RayView(PixelView):
 
     @in_full_precision
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        # What the view covers takes most of the time of `to_view`. Dynamo cannot copy.
-        view = self if torch.compiler.is_dynamo_compiling() else copy.copy(self)
+        if torch.compiler.is_dynamo_compiling():
+            return self  # as Dynamo cannot copy
+        # What the view covers takes most of the time of `to_view`.
+        view = copy.copy(self)
         view._known = self._layout(check_lens(lens, size), size)
         return view
 
