@@ -17,7 +17,7 @@ State = tuple[Tensor, ...]
 
 _STEPS = 40  # Newton steps or bisections
 _TABLE = 1024  # entries of a table of the function
-_HAS_LOOPS = torch.__version__ >= (2, 12)  # torch.onnx of 2.10 cannot translate a loop
+_HAS_LOOPS = torch.__version__ >= "2.12"  # torch.onnx of 2.10 cannot translate a loop
 
 
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
