@@ -8,6 +8,7 @@ from torch import nn
 
 from darswin import create_model, frames
 from darswin.deploy import camera
+from darswin.deploy.quantize import quantize_model
 from darswin.lens import Equidistant
 
 MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
@@ -66,6 +67,11 @@ def model_of(family="darswin_a", channels=3, **options):
 
 def size_of(model):
     return model.image_size or (70, 80)
+
+
+def quantized_of(model):
+    pictures = torch.from_numpy(random_frame(*size_of(model), 3, 2)).permute(3, 2, 0, 1)
+    return quantize_model(model, [(pictures, ROUND)])
 
 
 def network_of(model, folder, lens=ROUND, **options):

@@ -142,8 +142,8 @@ def test_without_onednn_it_warns_and_goes_on(monkeypatch):
 def test_what_cannot_be_optimized():
     model = network("darswin_a_nano")
     for wrong, options, kind, message in (
-        (torch.nn.Linear(2, 2), {}, TypeError, "model of create_model, got Linear"),
-        ("model", dict(dtype="fastest"), TypeError, "model of create_model, got str"),
+        (torch.nn.Linear(2, 2), {}, TypeError, "a LensAdapter of one, got Linear"),
+        ("model", dict(dtype="fastest"), TypeError, "a LensAdapter of one, got str"),
         (optimize(model), {}, TypeError, "got an optimized model"),
         (model, dict(dtype=torch.float16), ValueError, "got torch.float16"),
         (model, dict(lens=LENSES), ValueError, "lens must be one lens"),

@@ -1,6 +1,6 @@
 """`_network` and `_run`: whole networks as one operator.
 
-test_frame_networks.py compares results with models.
+tests/deploy/test_contract.py compares results with models.
 """
 
 import math
@@ -14,7 +14,7 @@ from helpers import network
 
 from darswin import optimize
 from darswin.deploy.networks import frame_program
-from darswin.deploy.program import Checked, Program, Weights
+from darswin.deploy.program import Checked
 from darswin.lens import Spherical
 
 CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -124,19 +124,3 @@ def test_networks_survive_threads_and_forks():
     child.start()
     child.join(60)
     assert child.exitcode == 0
-
-
-def test_numbers_that_are_copied_and_changed():
-    program = Program(Weights())
-    x = program.input(2, 6, 4)
-    program.output(program.permuted(x, (2, 3, 2, 4), (1, 0, 3, 2), 3, 2, 8))
-    program.output(program.permuted(x, x.shape, (2, 0, 1), 4, 2, 6))
-    program.output(program.mean(x))
-    program.output(program.resized(x, (5, 3)))
-    numbers = torch.randn(2, 2, 6, 4)
-    got = program.checked()([numbers])
-    permuted = numbers.view(2, 2, 3, 2, 4).permute(0, 2, 1, 4, 3).reshape(2, 3, 2, 8)
-    first = numbers.permute(0, 3, 1, 2)
-    resized = torch.nn.functional.interpolate(first, (5, 3), mode="bilinear").permute(0, 2, 3, 1)
-    for x, want in zip(got, (permuted, first, numbers.mean((1, 2)), resized), strict=True):
-        torch.testing.assert_close(x, want)
