@@ -50,14 +50,14 @@ def bilinear(image, x, y):
     return top * (1 - lower) + bottom * lower
 
 
-def model_of(family="darswin_a", channels=3, **options):
-    """A small model whose signal neither grows nor dies."""
+def model_of(family="darswin_a", channels=3, *, size="nano", **options):
+    """A model of a family whose signal neither grows nor dies."""
     torch.manual_seed(0)
     if family.startswith("swin_unet"):
         options = dict(image_size=64) | options
     mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
     model = create_model(
-        f"{family}_nano", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
+        f"{family}_{size}", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
     ).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):

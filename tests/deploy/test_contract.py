@@ -64,7 +64,6 @@ CASES = [
     ("darswin_a", dict(periodic_bias=True, spacing="g")),
     *(("adapter", dict(network=name, view=view)) for name, view in ADAPTERS),
 ]
-LARGE = [(name, {}) for name in list_models() if not name.endswith("nano")]
 
 
 def made(family, channels=3, **options):
@@ -157,9 +156,9 @@ def test_a_network_gives_the_same_however_it_runs(case, lens, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", LARGE, ids=str)
-def test_so_do_the_large_sizes(case, tmp_path):
-    check(case, *LENSES["round"], tmp_path)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_so_do_the_large_sizes(family, tmp_path):
+    check((family, dict(size="small")), *LENSES["round"], tmp_path)
 
 
 @torch.no_grad()
