@@ -56,9 +56,8 @@ def model_of(family="darswin_a", channels=3, *, size="nano", **options):
     if family.startswith("swin_unet"):
         options = dict(image_size=64) | options
     mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
-    model = create_model(
-        f"{family}_{size}", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
-    ).eval()
+    options = dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options
+    model = create_model(f"{family}_{size}", **options).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
