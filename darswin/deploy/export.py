@@ -155,12 +155,14 @@ def _program(
         module = _OfTensors(
             model, lens, size, pixels, tensors, sampled=sampled, any_strides=any_strides
         )
-        batch = {0: torch.export.Dim("batch")}
+        batch = torch.export.Dim("batch")
+        # What a view of several pictures sees has all of them in a row.
+        rows = {"tokens": model.view.count * batch} if sampled and model.view.count > 1 else {}
         program = torch.export.export(
             module,
             tuple(pixels.values()),
             tensors,
-            dynamic_shapes=dict.fromkeys((*pixels, *tensors), batch),
+            dynamic_shapes={name: {0: rows.get(name, batch)} for name in (*pixels, *tensors)},
             strict=False,  # it takes half of the time of a strict export
         )
         for graph in program.graph_module.modules():  # its own, and those of its loops
