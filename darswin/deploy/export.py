@@ -152,7 +152,7 @@ def _program(
             size = height, width
             if sampled:
                 pixels = _sampled(model, images, lens, size)
-        rows = dict.fromkeys((*pixels, *tensors), {0: batch})
+        rows = {key: {0: batch} for key in (*pixels, *tensors)}
         if sampled and isinstance(model, Model) and model.view.count > 1:
             rows["tokens"] = {0: model.view.count * batch}  # all pictures of an image, in turn
         module = _OfTensors(
