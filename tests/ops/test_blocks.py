@@ -210,7 +210,7 @@ def test_blocks_that_do_not_fit():
     blocks = OwnBlocks(stage(depth=1), Weights())
     table, x = torch.zeros(1, *blocks.table_shapes[0]), torch.zeros(1, *blocks.map_shape)
     blocks(x, [table])
-    words, weights = blocks.written.words(), blocks.weights.words
+    words, weights = blocks.written.words(), blocks.written.weights.words
     run = Checked(weights, words)
     assert words[-25] == BLOCK and (blocks.heads, blocks.mlp_dim) == (3, 60)
     wrong = {1: (9, 0), 2: (0,), 3: (20,), 4: (0, -3, 5), 5: (0, 2**61), 6: (-1, 2**40),
