@@ -36,8 +36,7 @@ LENSES = {
     "affine": Polynomial([26.0, -1.1], 1.6, [41.2, 30.3], affine=[[1.0, 0.02], [0.0, 0.9]]),
     "general": Mei(2.35, 80.0, [0.032, 2.4], 1.7, [40.3, 33.1], tangential=[6e-3, -3.5e-3]),
 }
-REFUSED = {"dat"}
-FAMILIES = sorted({name.rpartition("_")[0] for name in list_models()} - REFUSED)
+FAMILIES = sorted({name.rpartition("_")[0] for name in list_models()})
 UNETS = [name for name in FAMILIES if "unet" in name and name != "conv_unet"]
 CLASSIFIERS = [name for name in FAMILIES if "unet" not in name]
 CASES = [
@@ -57,7 +56,15 @@ CASES = [
     ("swin_unet", dict(view=dict(name="mercator", size=(64, 128)))),
     ("swin", dict(image_size=(24, 48), patch_size=3)),
     ("darswin_a", dict(periodic_bias=True, spacing="g")),
+    ("dat", dict(image_size=(16, 40), window=(2, 5), blocks=("D", "LD", "DS"), groups=(1, 2, 4))),
+    ("dat", dict(depths=(2, 1, 2), blocks=("DL", "D", "D"), groups=(1, 1, 1), offset_range=9.0)),
 ]
+
+
+def unusual():
+    model = model_of()
+    model.head = nn.Sequential(model.head, nn.Sigmoid())
+    return model
 
 
 @torch.no_grad()
@@ -159,7 +166,7 @@ def test_labels_and_normalization(tmp_path):
 @pytest.mark.parametrize(
     ("model", "changes", "error", "words"),
     [
-        (lambda: model_of("dat"), dict(size=(32, 32)), TypeError, "got DAT"),
+        (unusual, {}, TypeError, r"got DarSwin: head.1 \(Sigmoid\): .* is no instruction"),
         (lambda: model_of().to(torch.bfloat16), {}, TypeError, "float32 weights, got .*bfloat16"),
         (lambda: model_of().double(), {}, TypeError, "float32 weights, got .*float64"),
         (lambda: LensAdapter(nn.Flatten(), 8, view="tiles", mean=0, std=1), {}, TypeError,

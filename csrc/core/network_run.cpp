@@ -82,7 +82,9 @@ struct Network::Run {
 
   // Consecutive blocks of one map, part by part of the batch.
   void blocks(const Step* begin, const Step* end, void* scratch) const {
-    const int64_t slot = begin->arguments[0], most = part(*begin);
+    const int64_t slot = begin->arguments[0];
+    int64_t most = batch;
+    for (const Step* step = begin; step != end; ++step) most = std::min(most, part(*step));
     const int64_t parts = units(batch, most);
     for (int64_t k = 0; k < parts; ++k) {
       const int64_t first = batch * k / parts, count = batch * (k + 1) / parts - first;
