@@ -10,9 +10,9 @@ from torch import nn
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import Own, OwnBlocks
-from darswin.deploy.program import BLOCK, DEFORM, Checked, Weights
+from darswin.deploy.program import BLOCK, DEFORM, Checked, Program, Weights
 from darswin.layers.attention import WindowAttention
-from darswin.layers.transformer import Block
+from darswin.layers.transformer import Block, Mlp
 from darswin.models.dat import DeformableAttention
 from darswin.ops import use_reference
 
@@ -168,6 +168,22 @@ def test_blocks_are_those_of_the_layers(batch, sizes):
     if batch:
         floor = 4 * torch.finfo(torch.float32).eps * want.abs().max()
         assert (got - want).abs().max() <= max(2 * (own - want).abs().max(), floor)
+
+
+def test_blocks_of_different_widths_go_in_parts_that_fit_all():
+    narrow, wide = stage(depth=1), stage(depth=1)
+    wide[0].mlp = Mlp(24, 960).requires_grad_(False)
+    program = Program(Weights())
+    x = out = program.input(8, 16, 24)
+    for blocks in (narrow, wide):
+        table = program.input(*blocks[0].attn.position_bias.table.shape)
+        out = program.blocks(out, OwnBlocks(blocks, program.weights), [table])
+    program.output(out)
+    checked, numbers = program.checked(), torch.randn(100, *x.shape)  # 34 images are a part
+    tables = [blocks[0].attn.position_bias() for blocks in (narrow, wide)]
+    got, alone = (checked([given, *tables])[0] for given in (numbers, numbers[99:]))
+    assert torch.equal(got[99:], alone)
+    torch.testing.assert_close(got, run(wide, run(narrow, numbers)))
 
 
 def test_same_bits_on_any_number_of_threads():
