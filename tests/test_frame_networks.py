@@ -30,6 +30,12 @@ from darswin.models import Encoder, LensAdapter
 from darswin.views import PolarView
 
 
+def unusual():
+    model = model_of()
+    model.head = nn.Sequential(model.head, nn.Sigmoid())
+    return model
+
+
 @torch.no_grad()
 def by_model(model, frame, lens=ROUND):
     """The model's result for a frame, a list of arrays; a classifier's probabilities."""
@@ -85,7 +91,7 @@ def test_labels_and_normalization(tmp_path):
 @pytest.mark.parametrize(
     ("model", "changes", "error", "words"),
     [
-        (lambda: model_of("dat"), dict(size=(32, 32)), TypeError, "got DAT"),
+        (unusual, {}, TypeError, r"got DarSwin: head.1 \(Sigmoid\): .* is no instruction"),
         (lambda: model_of().to(torch.bfloat16), {}, TypeError, "float32 weights, got .*bfloat16"),
         (lambda: model_of().double(), {}, TypeError, "float32 weights, got .*float64"),
         (lambda: LensAdapter(nn.Flatten(), 8, mean=0, std=1), {}, TypeError, "got Flatten"),
