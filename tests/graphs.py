@@ -62,7 +62,7 @@ OUTPUTS = {
     "numbers": ("float[B,K] logits", "logits = Identity(light)"),
     "undecoded": (
         "float[B,4,K] output0",
-        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 7]>() "
+        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 9]>() "
         "output0 = Expand(box2, shape)",
     ),
     "boxes of other shape": (
@@ -147,21 +147,23 @@ def write_detector(
     if masked:
         shape = [batch, 64, 64]
         inputs.append(helper.make_tensor_value_info("pixel_mask", TensorProto.INT64, shape))
-    for name, value in outputs.items():
+    for number, (name, value) in enumerate(outputs.items()):
         kind = helper.np_dtype_to_tensor_dtype(value.dtype)
         first = "value" if name == sized else name
         if batch == "B" and value.ndim:
-            nodes += onnx.parser.parse_graph(f"""g (float[B,3,H,W] images) => (int64[K] to) {{
-                {name}_n = Shape<start=0, end=1>(images)
-                {name}_k = Constant<value_ints={list(value.shape[1:])}>()
-                {name}_to = Concat<axis=0>({name}_n, {name}_k) }}""").node
-            constant = helper.make_node(
-                "Constant", [], [f"{name}_1"], value=numpy_helper.from_array(value)
-            )
-            nodes += [constant, helper.make_node("Expand", [f"{name}_1", f"{name}_to"], [first])]
+            one, to = f"one{number}", f"to{number}"
+            rest = numpy_helper.from_array(np.array(value.shape[1:], np.int64))
+            constant = numpy_helper.from_array(value)
+            nodes += [
+                helper.make_node("Shape", ["images"], [f"n{number}"], start=0, end=1),
+                helper.make_node("Constant", [], [f"k{number}"], value=rest),
+                helper.make_node("Concat", [f"n{number}", f"k{number}"], [to], axis=0),
+                helper.make_node("Constant", [], [one], value=constant),
+            ]
+            nodes.append(helper.make_node("Expand", [one, to], [first]))
         else:
-            value_ = numpy_helper.from_array(value)
-            nodes.append(helper.make_node("Constant", [], [first], value=value_))
+            constant = numpy_helper.from_array(value)
+            nodes.append(helper.make_node("Constant", [], [first], value=constant))
         if name == sized:
             like = helper.make_node("Cast", ["by"], ["as"], to=kind)
             nodes += [like, helper.make_node("Mul", ["value", "as"], [name])]

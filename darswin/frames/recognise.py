@@ -56,7 +56,7 @@ def form_of(
     if form is not None and form.scores == "?":
         kind = _MODELS.get(scores or str(metadata.get("model_type")))
         if kind is None:
-            of = "logits, of softmax (DETR, YOLOS) or of sigmoid (RT-DETR, D-FINE, RF-DETR)"
+            of = "the scores are logits, of softmax (DETR, YOLOS) or of sigmoid (RT-DETR, D-FINE)"
             raise _question("scores", of, "put the model's config.json beside the file")
         form = replace(form, **kind)
     return form
@@ -74,7 +74,7 @@ def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
 
 
 def _question(word: str, found: str, instead: str) -> ValueError:
-    return naming(ValueError(f"it gives {found}: say which by `{word}`, or {instead}"), word)
+    return naming(ValueError(f"{found}: say which by `{word}`, or {instead}"), word)
 
 
 def _whole(**names: str | None) -> Where:
@@ -186,7 +186,7 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
         return Form("boxes, score and class", _columns(name, boxes=4, scores=1, labels=1))
     if width in (7, 57):
         kind = "turned boxes (obb)" if width == 7 else "keypoints (pose)"
-        found = f"{name} {shape}, which may be {kind} of Ultralytics or something else"
+        found = f"they may be {kind} of Ultralytics, or something else"
         raise _question("task", found, "keep the metadata that `yolo export` writes")
     return None
 
@@ -200,7 +200,7 @@ def _ultralytics(
         rest = total - 4 - classes if classes else 0 if total == 5 else -1
         if rest not in (0, 1):
             found = (
-                f"{name} of {total} rows, which may be boxes of {total - 4} classes (detect), "
+                f"they may be boxes of {total - 4} classes (detect), "
                 f"turned boxes of {total - 5} (obb), or keypoints (pose)"
             )
             raise _question("task", found, "export it by `yolo export`, which writes metadata")
