@@ -62,7 +62,7 @@ OUTPUTS = {
     "numbers": ("float[B,K] logits", "logits = Identity(light)"),
     "undecoded": (
         "float[B,4,K] output0",
-        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 9]>() "
+        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 11]>() "
         "output0 = Expand(box2, shape)",
     ),
     "boxes of other shape": (

@@ -126,7 +126,7 @@ def test_the_size_is_the_graphs_or_given(tmp_path):
 @pytest.mark.parametrize(
     ("outputs", "said"),
     [
-        ("undecoded", r"has the outputs output0 \(1, 4, 9\); known are the forms of .*decoder"),
+        ("undecoded", r"has the outputs output0 \(1, 4, 11\); known are the forms of .*decoder"),
         (
             "texts",
             r"has the outputs labels \(1, 1\), boxes \(1, 1, 4\), scores \(1, 1\); known are",

@@ -27,6 +27,7 @@ from darswin.cli.pictures import (
 )
 from darswin.compat import load_official
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.frames.recognise import TASKS
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
@@ -34,22 +35,24 @@ from darswin.models.saving import ModelCard, NoCardError, load_model, model_file
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.parameters import check, naming
-from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import read_frames
 
 ANSWERS = "predictions.json"
+AnyTask = Literal["classification", "segmentation", "distance", "detect", "pose", "obb", "segment"]
 
 
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
     model: str | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None, task: Task | None = None, top: int | None = None,
+    coefficients: Coefficients | None = None, task: AnyTask | None = None, top: int | None = None,
     every: int = 1, out: str | None = None, network: str | None = None, view: str | None = None,
     size: tuple[int, int] | None = None, fov_deg: float | None = None,
     up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
     std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
     threshold: float | None = None, labels: str | None = None,
+    scores: Literal["softmax", "sigmoid"] | None = None,
+    format: Literal["json", "coco", "yolo"] | None = None,
 ) -> list[dict]:  # fmt: skip
     """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
     or runs any network in an ONNX file, such as a detector, on a view of them.
@@ -76,7 +79,8 @@ def predict(
             classes are numbers.
         camera: the name or number of the camera, if the calibration has several.
         coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
-        task: the task that the model must have. Another model is an error.
+        task: the task that the model must have. Another model is an error. Of a network of
+            Ultralytics whose file lost its metadata: detect, pose, obb or segment.
         top: the number of classes to list for each image. The default is 5. A network in an ONNX
             file then gives classes in place of numbers.
         every: the step between the frames of a video that are predicted; 1 predicts all.
@@ -84,12 +88,12 @@ def predict(
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
             in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json. For a
-            network, it gets overlays/NAME.jpg with boxes, or maps/OUTPUT/NAME.npy, and
+            network, it gets overlays/NAME.jpg with what was found, or maps/OUTPUT/NAME.npy, and
             predictions.json; the numbers of a network without boxes and maps are printed.
-        network: in place of a run, an ONNX file of any network. Its outputs are boxes, scores and
-            labels by these names, one output (B, N, 6) of x0, y0, x1, y1, score and class, maps
-            (B, K, H, W) of the size of the view or of a whole fraction of it, or numbers (B, K). It
-            needs onnxruntime, of the extra onnx.
+        network: in place of a run, an ONNX file of any network: a detector as the exporters of
+            YOLO, RT-DETR, RF-DETR, DETR, torchvision and others write it, with masks, keypoints and
+            turned boxes; maps (B, K, H, W) of the size of the view or of a whole fraction of it; or
+            numbers (B, K). It needs onnxruntime, of the extra onnx.
         view: what the network sees of the pictures, by its lens: the name of a view of
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
@@ -99,17 +103,26 @@ def predict(
         up: the direction away from gravity, as x right, y down and z forward of the camera. The
             default is the top of the picture, 0,-1,0.
         mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
-            one for each channel. The default is 0.
-        std: the same for std. The default is 1. Divide numbers for pixels from 0 to 255 by 255.
-        channels: the order of colours that the network expects. The default is rgb.
+            one for each channel. The default is that of the form of a detector, which is printed,
+            and else 0, also if only std is given.
+        std: the same for std, else 1. Divide numbers for pixels from 0 to 255 by 255.
+        channels: the order of colours that the network expects. The default is that of the form of
+            a detector, and else rgb.
         threshold: the lowest score of boxes. The default is 0.3.
         labels: a file with the names of the network's classes: a text file, whose line k names
             class k, from 0, and whose empty lines are no classes; JSON or YAML with a list or with
-            {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt).
+            {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt). The default
+            is the names in the file of the network, if it has any.
+        scores: what makes probabilities of the logits of a DETR of transformers, if no config.json
+            is beside the file.
+        format: what else to write of detections, beside predictions.json: coco writes coco.json,
+            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, place and
+            score in each line.
     """
     options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
-        "channels": channels, "threshold": threshold, "labels": labels,
+        "channels": channels, "threshold": threshold, "labels": labels, "scores": scores,
+        "format": format,
     }  # fmt: skip
     if network is None and (given := [k for k, value in options.items() if value is not None]):
         raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")
@@ -141,8 +154,10 @@ def predict(
     else:
         from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
 
-        through = NetworkAnswers(network, **options, top=top)
+        told = task if task in TASKS else None
+        through = NetworkAnswers(network, **options, top=top, task=told)
         kind, make = through.network.kind, through.into
+        task = None if told and kind == "detections" else task
     if task not in (None, kind):
         raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
     if top is not None and kind not in ("classification", "numbers"):

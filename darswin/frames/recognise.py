@@ -165,7 +165,7 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
         return None
     (_, count, width), known, masks = shape, grids(size), 32 * len(protos)
     strides, each = known.get(count, ((), 0))
-    last = known.get(width, ((), 0))[1] == 1
+    last = count > 4 and known.get(width, ((), 0))[1] == 1
     shared = _whole(protos=protos[0] if protos else None)
     if last or ((task or protos) and not each):
         task = task or "segment" * len(protos)

@@ -381,7 +381,7 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --threshold nan", "--threshold must be finite, got nan"),
         ("--network gone.onnx", "there is no file gone.onnx"),
         ("--network p.png", r"onnxruntime cannot read p\.png"),
-        ("--network raw.onnx", r"raw.onnx has the outputs output0 \(1, 4, 7\); known are"),
+        ("--network raw.onnx", r"raw.onnx has the outputs output0 \(1, 4, 11\); known are"),
         ("--network nan.onnx", "nan.onnx computes NaN"),
         ("--network n.onnx --labels gone.txt", "gone.txt"),
         ("--network n.onnx --task distance", "--task is distance, but n.onnx is a model for detec"),
@@ -547,7 +547,7 @@ HEADS = {f"p{k}": np.zeros((1, 255, 64 // k, 64 // k), F) for k in (8, 16, 32)}
 @pytest.mark.parametrize(
     ("outputs", "said"),
     [
-        (dict(detection_out=np.zeros((1, 1, 100, 7), F)), r"detection_out \(1, 1, 100, 7\); known"),
+        (dict(heads=np.zeros((1, 1, 100, 9), F)), r"heads \(1, 1, 100, 9\); known"),
         (dict(maps=np.zeros((1, 3, 32, 16), F)), r"maps \(1, 3, 32, 16\); known are .*fraction"),
         (dict(maps=np.zeros((1, 3, 48, 48), F)), r"maps \(1, 3, 48, 48\); known"),
         (dict(maps=np.zeros((1, 3, 128, 128), F)), r"maps \(1, 3, 128, 128\); known"),
