@@ -3,7 +3,6 @@
 Each form is written here as its exporter writes it, without the code that reads it.
 """
 
-import ast
 import itertools
 import json
 import math
@@ -17,7 +16,6 @@ pytest.importorskip("onnxruntime")
 from graphs import write_detector
 
 from darswin.frames.onnx import OnnxNetwork
-from darswin.frames.recognise import TASKS
 
 SIZE = HEIGHT, WIDTH = 160, 224
 K = 12
@@ -80,7 +78,14 @@ def beside(*parts):
 
 
 def cell_row(width, *, first=()):
-    return lambda x, y, s: [(x + 0.5) * s, (y + 0.5) * s, s, s, *first, *[0.01] * (width - len(first))]
+    return lambda x, y, s: [
+        (x + 0.5) * s,
+        (y + 0.5) * s,
+        s,
+        s,
+        *first,
+        *[0.01] * (width - len(first)),
+    ]
 
 
 def yolo(rows):
@@ -108,7 +113,9 @@ def nanodet():
         at = int(np.argmin(distances))
         x, y, s = strides[at]
         box = BOXES[k]
-        for side, length in enumerate((x * s - box[0], y * s - box[1], box[2] - x * s, box[3] - y * s)):
+        for side, length in enumerate(
+            (x * s - box[0], y * s - box[1], box[2] - x * s, box[3] - y * s)
+        ):
             low, part = divmod(length / s, 1)
             share = np.full(8, 1e-9)
             share[int(low)], share[int(low) + 1] = 1 - part, max(part, 1e-9)
@@ -133,8 +140,11 @@ FULL = lambda rows, to=300: np.concatenate((rows, np.zeros((to - K, *rows.shape[
 ULTRA = dict(names=NAMES, author="Ultralytics", imgsz=[*SIZE])
 SOFTMAX_ = np.log(np.column_stack((one_hot(91, low=1e-9), 1 - SCORES - 90e-9)))
 POSE = ULTRA | dict(task="pose", kpt_shape=[17, 3], names={0: "person"})
-EXTRA = {"segment": WEIGHTS, "obb": ANGLES, "pose": POINTS}
 ROWS = beside(BOXES, SCORES, LABELS)
+
+
+def of(task):
+    return dict(metadata=ULTRA | dict(task=task))
 
 
 def row(values, *more):
@@ -146,30 +156,35 @@ FORMS = {
     "own": (dict(boxes=FULL(BOXES), scores=FULL(SCORES), labels=FULL(LABELS).astype(int)), {}),
     "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
     "table": (dict(out=FULL(ROWS)), {}),
-    "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), dict(metadata=ULTRA | {"task": "detect"})),
-    "detect without task": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), dict(metadata={"names": [*NAMES.values()]})),
+    "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
+    "detect without task": (
+        dict(output0=yolo(beside(CENTRED, one_hot(80)))),
+        dict(metadata={"names": [*NAMES.values()]}),
+    ),
     "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(told="detect")),
     "segment": (
         dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos()),
-        dict(metadata=ULTRA | {"task": "segment"}),
+        of("segment"),
     ),
     "pose": (dict(output0=yolo(beside(CENTRED, SCORES, POINTS))), dict(metadata=POSE)),
     "pose of 2": (
         dict(output0=yolo(beside(CENTRED, SCORES, POINTS[..., :2]))),
         dict(metadata=POSE | {"kpt_shape": [17, 2]}),
     ),
-    "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), dict(metadata=ULTRA | {"task": "obb"})),
-    "detect, end to end": (dict(output0=FULL(ROWS)), dict(metadata=ULTRA | {"task": "detect", "end2end": True})),
+    "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
+    "detect, end to end": (dict(output0=FULL(ROWS)), of("detect")),
     "segment, end to end": (
         dict(output0=FULL(beside(ROWS, WEIGHTS)), output1=protos()),
-        dict(metadata=ULTRA | {"task": "segment"}),
+        of("segment"),
     ),
-    "pose, end to end": (dict(output0=FULL(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE)),
+    "pose, end to end": (
+        dict(output0=FULL(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
+    ),
     "obb, end to end": (
-        dict(output0=FULL(beside(CENTRED, SCORES, LABELS, ANGLES))), dict(metadata=ULTRA | {"task": "obb"}),
+        dict(output0=FULL(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
     ),
     "RT-DETR of Ultralytics": (
-        dict(output0=FULL(beside(CENTRED_PARTS, one_hot(80)))), dict(metadata=ULTRA | {"task": "detect"}),
+        dict(output0=FULL(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
     ),
     "YOLOv5": (
         dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
@@ -194,7 +209,10 @@ FORMS = {
     "YOLOX": (dict(output=yolox(False)), {}),
     "YOLOX, decoded": (dict(output=yolox(True)), {}),
     "NanoDet-Plus": (dict(output=nanodet()), {}),
-    "RF-DETR": (dict(dets=FULL(CENTRED_PARTS), labels=FULL(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {}),
+    "RF-DETR": (
+        dict(dets=FULL(CENTRED_PARTS),
+             labels=FULL(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
+    ),
     "RF-DETR segment": (
         dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
     ),
@@ -202,17 +220,25 @@ FORMS = {
         dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes"),
     ),
     "DETR": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS), dict(model_type="detr", masked=True)),
-    "DETR, told": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))), dict(scores="softmax")),
-    "D-FINE of transformers": (dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine")),
+    "DETR, told": (
+        dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))),
+        dict(scores="softmax"),
+    ),
+    "D-FINE of transformers": (
+        dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine"),
+    ),
     "TensorFlow": (
         {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
          "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0)}, {},
     ),
     "EfficientDet": (dict(detections=row(BOXES[:, YX], SCORES, LABELS)), {}),
     "MMDeploy": (dict(dets=beside(BOXES, SCORES), labels=LABELS), {}),
-    "MMDeploy segment": (dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {}),
+    "MMDeploy segment": (
+        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
+    ),
     "EfficientNMS": (
-        dict(num_dets=np.array([K]), det_boxes=FULL(BOXES, 100), det_scores=FULL(SCORES, 100) - (np.arange(100) >= K),
+        dict(num_dets=np.array([K]), det_boxes=FULL(BOXES, 100),
+             det_scores=FULL(SCORES, 100) - (np.arange(100) >= K),
              det_classes=FULL(LABELS, 100).astype(int)), {},
     ),
     "YOLO-NAS": (
@@ -220,7 +246,8 @@ FORMS = {
              scores=dense(one_hot(80), lambda *_: [0.01] * 80)), {},
     ),
     "YOLO-NAS with NMS": (
-        dict(num_predictions=np.array([K]), pred_boxes=BOXES, pred_scores=SCORES, pred_classes=LABELS), {},
+        dict(num_predictions=np.array([K]), pred_boxes=BOXES, pred_scores=SCORES,
+             pred_classes=LABELS), {},
     ),
 }  # fmt: skip
 # Those of all pictures in one table, or of one picture without a batch.
@@ -321,7 +348,7 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         network = OnnxNetwork(path)
     except ValueError as error:
         assert form in ASKED, error
-        assert "has the outputs" in str(error) and "`" in str(error) or "known are" in str(error)
+        assert ("has the outputs" in str(error) and "`" in str(error)) or "known are" in str(error)
     else:
         assert form not in ASKED
         (found,) = network(np.zeros((1, 3, *SIZE), np.float32))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -159,13 +159,17 @@ def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: fl
     points = part.get("points")
     if points is not None:
         width = points.shape[2] if points.ndim == 3 else form.point
-        points = points.reshape(len(boxes), -1, width).astype(float)
+        shape = len(boxes), math.prod(points.shape[1:]) // width, width
+        points = points.reshape(shape).astype(float)
     masks = _masks(form, found, part, boxes, size)
     return Detections(boxes, score[keep], labels[keep], points, masks, turned)
 
 
-def _masks(form: Form, found: Outputs, part: Outputs, boxes: np.ndarray, size: Size) -> Any:
+def _masks(
+    form: Form, found: Outputs, part: Outputs, boxes: np.ndarray, size: Size
+) -> np.ndarray | None:
     """The masks of things, as they are or of those that all things share; None without any."""
+    masks: np.ndarray
     if "protos" in found:
         weights, protos = part["weights"], found["protos"]
         masks = np.tensordot(weights.astype(np.float32), protos.astype(np.float32), 1)
