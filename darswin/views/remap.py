@@ -126,10 +126,10 @@ class Remap:
         return self._moved(points, lambda p: self.some_lens.unproject_points(p, self.size))
 
     def boxes_to_image(self, boxes: Any) -> MovedBoxes:
-        """Boxes (K, 4) of the view → boxes of the picture, by the ellipses inside them.
+        """Boxes (K, 4 or 5) of the view → boxes of the picture, by the ellipses inside them.
 
-        Boxes are cut at the edges of the view first, and those without an area are NaN. See
-        `darswin.boxes.carry`.
+        Boxes are cut at the edges of the view first, unless they are turned, and those without an
+        area are NaN. See `darswin.boxes.carry`.
         """
         return self._boxes(boxes, self.to_image, (self.view_size, self.size), self.rays)
 
@@ -145,11 +145,13 @@ class Remap:
         table = (
             boxes.detach().to("cpu", torch.float64).numpy() if isinstance(boxes, Tensor) else boxes
         )
-        table = of_boxes.clip(np.asarray(table, np.float64), sizes[0])
-        table[(table[:, 2:] <= table[:, :2]).any(1)] = np.nan
+        table = np.array(table, np.float64)
+        if table.shape[-1] != 5:
+            table = of_boxes.clip(table, sizes[0])
+        table[~(of_boxes.turned(table)[:, 2:4] > 0).all(1)] = np.nan
         found = [*of_boxes.carry(table, points_map, sizes[1])]
         if self.lens is not None:
-            found.append(np.nan_to_num(to_rays((table[:, :2] + table[:, 2:] - 1) / 2)))
+            found.append(np.nan_to_num(to_rays(of_boxes.turned(table)[:, :2] - 0.5)))
         if isinstance(boxes, Tensor):
             dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
             found = [torch.from_numpy(values).to(boxes.device, dtype) for values in found]
