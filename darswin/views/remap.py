@@ -16,6 +16,8 @@ from darswin.ops.checks import check_pair, per_channel, tensor_there
 from darswin.utils.arrays import as_tensor
 from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, check_images, check_lens
+from darswin.views.floor import on_floor
+from darswin.views.orientation import Vector
 
 if TYPE_CHECKING:
     from darswin.frames.plans import Plan, Sampler
@@ -137,6 +139,26 @@ class Remap:
         """Boxes (K, 4) of the picture → boxes of the view: the inverse of `boxes_to_image`."""
         sizes = self.size, self.view_size
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
+
+    def floor(self, boxes: Any, height: float, up: Vector, radius: float = 0.0) -> Any:
+        """Where the things in boxes (K, 4) of a level view stand on the floor, (K, 2) in metres.
+
+        The origin is below the camera. y is ahead: along the level part of the optical axis, or of
+        the picture's top if the axis is within 10° of the vertical. x is to the right of it.
+
+        Args:
+            height: of the camera above the floor, m.
+            up: the direction away from gravity in the camera's frame. The view is level with it.
+            radius: of the things, which are upright cylinders, m. 0 finds their nearest points.
+
+        Returns:
+            NaN where the lower side of a box is not below the horizon, or at the lower edge of the
+            view, where a thing may be cut.
+
+        Raises:
+            ValueError: a number is out of its range, or the view is not level with `up`.
+        """
+        return on_floor(self, boxes, height, up, radius)
 
     def _boxes(
         self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair],
