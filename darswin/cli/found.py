@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from darswin import boxes
-from darswin.boxes.regions import box_of, shown_parts
+from darswin.boxes.turned import upright
 from darswin.frames.onnx import Detections
 from darswin.utils.image import with_channels
 from darswin.views import Remap
@@ -17,15 +17,16 @@ from darswin.viz.pixels import MOST_CLASSES, draw_boxes, overlay, palette
 Found = dict[str, Any]  # columns of things; masks are in run-length encoding
 Size = tuple[int, int]
 
-_ANGLES = np.linspace(0, 2 * np.pi, 288, endpoint=False)
-_CIRCLE = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), 1)
-_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
-
 
 def without_overlaps(one: Detections) -> Detections:
     """The best of the boxes that show the same thing, for a network that leaves this to others."""
-    kept = boxes.merge(one.boxes, one.scores, one.labels, inside=1.0)
+    kept = boxes.merge(_boxes_of(one), one.scores, one.labels, inside=1.0)
     return Detections(*(None if values is None else values[kept] for values in one))  # type: ignore[arg-type]
+
+
+def _boxes_of(one: Detections) -> np.ndarray:
+    """The boxes, turned if the network turns them: (K, 4 or 5)."""
+    return one.boxes if one.turned is None else one.turned
 
 
 def in_picture(remap: Remap, found: Sequence[Detections]) -> Found:
@@ -38,10 +39,7 @@ def in_picture(remap: Remap, found: Sequence[Detections]) -> Found:
     parts = []
     for number, (tile, one) in enumerate(zip(remap.tiles, found, strict=True)):
         part = {"scores": one.scores, "labels": one.labels}
-        if one.turned is None:
-            part["boxes"], part["visible"], _ = tile.boxes_to_image(one.boxes)
-        else:
-            part["turned"], part["boxes"], part["visible"] = _turned(tile, one.turned)
+        part["boxes"], part["visible"], _ = tile.boxes_to_image(_boxes_of(one))
         if one.keypoints is not None:
             places = boxes.carry_points(one.keypoints[..., :2], tile.to_image)
             part["keypoints"] = np.concatenate((places, one.keypoints[..., 2:]), -1)
@@ -56,50 +54,15 @@ def in_picture(remap: Remap, found: Sequence[Detections]) -> Found:
     else:
         order = boxes.merge(joined["boxes"], joined["scores"], joined["labels"])
     joined = {key: values[order] for key, values in joined.items()}
+    if joined["boxes"].shape[1] == 5:
+        joined["turned"] = joined["boxes"]
+        joined["boxes"] = upright(joined["turned"])
     if "masks" in joined:
         joined["masks"] = [
             boxes.encode_rle(remap.tiles[tile].back(found[tile].masks[row, None])[0] > 0.5)
             for tile, row in joined["masks"].tolist()
         ]  # one by one: those of all things could fill the memory
     return joined
-
-
-def _turned(tile: Remap, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turned boxes (K, 5) of a view, those around their ellipses in the picture, upright boxes
-    (K, 4), and the shares that are visible (K,)."""
-    frames = [_frame(*one) for one in turned]
-    shown = shown_parts(
-        [middle + _CIRCLE @ axes.T for middle, axes in frames],
-        lambda points: boxes.carry_points(points, tile.to_image), tile.size,
-    )  # fmt: skip
-    found, around = np.full((len(turned), 5), np.nan), np.full((len(turned), 4), np.nan)
-    for k, ((middle, axes), (parts, _)) in enumerate(zip(frames, shown, strict=True)):
-        if not parts:
-            continue
-        old, new = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-        around[k] = box_of([new])
-        # The map of the ellipse that is nearest to a linear one, and the turn nearest to it.
-        local = np.column_stack((np.ones(len(old)), (old - middle) @ np.linalg.inv(axes).T))
-        w, h = np.linalg.lstsq(local, new, rcond=None)[0][1:]
-        w, h = w / np.linalg.norm(w), h / np.linalg.norm(h)
-        h = h if w[0] * h[1] > w[1] * h[0] else -h  # a view may be mirrored
-        angle = math.atan2(w[1] - h[0], w[0] + h[1])
-        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        low, high = (new @ turn).min(0), (new @ turn).max(0)
-        found[k] = *(turn @ (low + high) / 2), *(high - low), angle
-    return found, around, np.array([share for _, share in shown])
-
-
-def _frame(x: float, y: float, w: float, h: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of a turned box, and the halves of its sides, the columns of (2, 2)."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array((x, y)), np.array([[cos * w, -sin * h], [sin * w, cos * h]]) / 2
-
-
-def corners(turned: np.ndarray) -> np.ndarray:
-    """The corners of turned boxes (K, 5): (K, 4, 2)."""
-    frames = [_frame(*one) for one in turned]
-    return np.array([m + 2 * _CORNERS @ axes.T for m, axes in frames]).reshape(-1, 4, 2)
 
 
 def drawn(image: np.ndarray, found: Found, texts: Sequence[str]) -> np.ndarray:
@@ -112,7 +75,7 @@ def drawn(image: np.ndarray, found: Found, texts: Sequence[str]) -> np.ndarray:
             mask = boxes.decode_rle(rle)
             laid[mask], where[mask] = color, True
         picture = overlay(picture, laid, where=where)
-    outlines = corners(found["turned"]) if "turned" in found else None
+    outlines = boxes.corners(found["turned"]) if "turned" in found else None
     picture = draw_boxes(picture, found["boxes"], texts, colors, outlines)
     for points, color in zip(found.get("keypoints", ()), colors, strict=False):
         for x, y in points[np.isfinite(points[:, 0]), :2].astype(int).tolist():
@@ -135,7 +98,7 @@ def coco_results(name: str, found: Found) -> list[dict[str, Any]]:
         if "masks" in found:
             one["segmentation"] = found["masks"][k]
         if "turned" in found:
-            one["segmentation"] = [rounded(corners(found["turned"][k, None])[0].ravel(), 2)]
+            one["segmentation"] = [rounded(boxes.corners(found["turned"][k, None])[0].ravel(), 2)]
         if "keypoints" in found:
             one["keypoints"] = rounded(_three(found["keypoints"][k]).ravel(), 2)
         results.append(one)
@@ -148,7 +111,7 @@ def yolo_lines(size: Size, found: Found) -> str:
     for k, (x0, y0, x1, y1) in enumerate(found["boxes"]):
         row = np.array((x0 + x1, y0 + y1, 2 * (x1 - x0), 2 * (y1 - y0))).reshape(2, 2) / 2 / sides
         if "turned" in found:
-            row = corners(found["turned"][k, None])[0] / sides
+            row = boxes.corners(found["turned"][k, None])[0] / sides
         if "masks" in found:
             mask = boxes.decode_rle(found["masks"][k]).astype(np.uint8)
             outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)

@@ -222,7 +222,7 @@ class NetworkAnswers(Answers):
             found = [without_overlaps(one) for one in found]
         self._boxes.add(found)
         things = in_picture(seen.remap, found)
-        there = boxes.spherical(things["boxes"], seen.remap.rays_of_image)
+        there = boxes.spherical(things.get("turned", things["boxes"]), seen.remap.rays_of_image)
         names = [self._name(label) for label in things["labels"].tolist()]
         texts = [f"{name} {score:.2f}" for name, score in zip(names, things["scores"], strict=True)]
         columns = {

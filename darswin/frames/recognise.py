@@ -46,19 +46,20 @@ def form_of(
     Raises:
         ValueError: the outputs may have several forms.
     """
-    own = str(metadata.get("task", ""))
-    if own and own not in TASKS:
-        return None
-    check("task", task, not own or task in (None, own), own)
+    own = metadata.get("task") if metadata.get("task") in TASKS else task
+    check("task", task, task in (None, own), str(own))
     outputs = {name: values for name, values in outputs.items() if values.ndim < 5}  # no raw heads
     form = _named(outputs) or _typed(outputs) or _pair(outputs, size)
-    form = form or _table(outputs, size, own or task or "", metadata)
+    form = form or _table(outputs, size, own or "", metadata)
     if form is not None and form.scores == "?":
         kind = _MODELS.get(scores or str(metadata.get("model_type")))
         if kind is None:
             of = "the scores are logits, of softmax (DETR, YOLOS) or of sigmoid (RT-DETR, D-FINE)"
             raise _question("scores", of, "put the model's config.json beside the file")
-        form = replace(form, **kind)
+        return replace(form, **kind)
+    if scores is not None:
+        text = "`scores` is for the logits of transformers, so leave it out"
+        raise naming(ValueError(text), "scores")
     return form
 
 
@@ -158,7 +159,7 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
     name, values, shape = tables[0], outputs[tables[0]], outputs[tables[0]].shape
     if shape[:2] == (1, 1) and shape[3:] == (7,) and size[0] * 7 != size[1] * shape[2]:
         return Form("SSD", _columns(name, image=1, labels=1, scores=1, boxes=4), in_parts=True)
-    if shape[1:] == (7,) and not (values[:, 0] % 1).any():
+    if shape[1:] == (7,) and not (values[:, 0] % 1).any() and _has_whole(values[:, 5:]):
         where = _columns(name, image=1, boxes=4, labels=1, scores=1)
         return Form("YOLOv7 or YOLO-NAS with NMS", where)
     if len(shape) != 3:
@@ -189,6 +190,10 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
         found = f"they may be {kind} of Ultralytics, or something else"
         raise _question("task", found, "keep the metadata that `yolo export` writes")
     return None
+
+
+def _has_whole(columns: np.ndarray) -> bool:
+    return bool((columns % 1 == 0).all(0).any())
 
 
 def _ultralytics(
