@@ -36,7 +36,7 @@ from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.parameters import check, naming
 from darswin.utils.tensor_files import read_metadata
-from darswin.utils.video import read_frames
+from darswin.utils.video import is_stream, read_frames, read_stream, stream_name
 
 ANSWERS = "predictions.json"
 AnyTask = Literal["classification", "segmentation", "distance", "detect", "pose", "obb", "segment"]
@@ -63,7 +63,9 @@ def predict(
     entry gives the speed in frames per second.
 
     Args:
-        paths: image files, videos, and folders of them. A model that comes with darswin has an
+        paths: image files, videos, and folders of them; or a camera, by its number, such as 0, its
+            device, or an address such as rtsp://…, of which each newest frame is taken until
+            Ctrl-C. A model that comes with darswin has an
             example picture, which is used if no paths are given.
         lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
             as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
@@ -148,7 +150,7 @@ def predict(
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
-    check_paths(paths)
+    check_paths([path for path in paths if not is_stream(path)])
     if network is None:
         kind, make = _of_model(weights, TOP if top is None else top)
     else:
@@ -218,14 +220,19 @@ def _of_model(
 
 
 def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> None:
-    """Predicts the frames of a video, and prints the speed."""
+    """Predicts the frames of a video or a camera, and prints the speed. Ctrl-C ends a camera."""
+    live = is_stream(name)
+    frames_of, said = (read_stream, stream_name(name)) if live else (read_frames, name)
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
-        for frame in read_frames(name, answers.channels, every):
+        for frame in frames_of(name, answers.channels, every):
             taken_with = _lens(lenses, name, frame.image, frame.orientation)
-            entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
+            entry = {"video": said, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
+    except KeyboardInterrupt:
+        if not live:
+            raise
     finally:
         answers.flush()
         seconds, network = time.perf_counter() - start, answers.seconds - before
@@ -235,9 +242,9 @@ def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> Non
                 "frames_per_second": round(frames / seconds, 1),
                 "network_frames_per_second": round(frames / network, 1),
             }
-            answers.found.append({"video": name, **speed})
+            answers.found.append({"video": said, **speed})
             print(
-                f"darswin: {name}: {frames} frames at {frames / seconds:.1f} frames/s; "
+                f"darswin: {said}: {frames} frames at {frames / seconds:.1f} frames/s; "
                 f"the network alone: {frames / network:.1f} frames/s",
                 file=sys.stderr,
             )

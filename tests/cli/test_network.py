@@ -290,6 +290,39 @@ def test_each_frame_of_a_video(tmp_path, capsys):
     assert "v.mp4: 3 frames at" in capsys.readouterr().err
 
 
+def test_a_stream_ends_by_ctrl_c_with_its_predictions(tmp_path, monkeypatch, capsys):
+    picture, box = picture_of("Equidistant", (36, -8), 1)
+
+    class Camera:
+        def __init__(self, source):
+            assert source == "rtsp://me:secret@host/door"
+
+        isOpened = release = lambda self: True  # noqa: N815
+        read = lambda self: (True, picture[..., ::-1])  # noqa: E731
+
+    seen, add = [], NetworkAnswers.add
+
+    def interrupted(self, entry, image, lens):
+        seen.append(entry["frame"])
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        add(self, entry, image, lens)
+
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    monkeypatch.setattr("darswin.utils.video.cv2.VideoCapture", Camera)
+    monkeypatch.setattr(NetworkAnswers, "add", interrupted)
+    argv = ["rtsp://me:secret@host/door", "--network", network, "--view", "tiles:5", "--every", "2"]
+    *found, speed = predict(*argv, out=tmp_path / "out", lens=lens_of("Equidistant"))
+    assert [entry["frame"] for entry in found] == seen[:2] and seen[1] - seen[0] >= 2
+    for entry in found:
+        (one,) = entry["detections"]
+        np.testing.assert_allclose(one["box"], box, atol=1.8)
+        assert entry["overlay"] == f"overlays/rtsp_host_door/{entry['frame']:06}.jpg"
+        assert (tmp_path / "out" / entry["overlay"]).is_file()
+    assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
+    assert "secret" not in capsys.readouterr().err
+
+
 def test_bad_files_are_named_and_all_others_are_written(disc, tmp_path):
     folder, _, expected = disc
     for name in ("b.png", "d.png"):
