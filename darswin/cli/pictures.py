@@ -30,7 +30,7 @@ class File(NamedTuple):
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
     """The files at the paths; a folder stands for all pictures and videos in it."""
-    files = []
+    files: list[File] = []
     for path in paths:
         names = [str(path)]
         if os.path.isdir(path) and not _is_picture(path):
