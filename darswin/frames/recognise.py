@@ -12,6 +12,8 @@ from darswin.utils.parameters import check, naming
 
 TASKS = ("detect", "pose", "obb", "segment")  # of Ultralytics
 SCORES = ("softmax", "sigmoid")
+_RT_DETR = "RT-DETR of Ultralytics"
+_PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
 _IMAGENET = Pixels((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 _NANODET = Pixels(_IMAGENET.mean[::-1], _IMAGENET.std[::-1], "bgr")
 _BYTES = Pixels(std=(1 / 255,), channels="bgr")  # from 0 to 255
@@ -168,9 +170,14 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
     strides, each = known.get(count, ((), 0))
     last = count > 4 and known.get(width, ((), 0))[1] == 1
     shared = _whole(protos=protos[0] if protos else None)
+    parts = 0 < values[..., :4].max(initial=0) < _PART
     if last or ((task or protos) and not each):
         task = task or "segment" * len(protos)
-        return _ultralytics(name, count if last else width, last, task, metadata, shared)
+        form = _ultralytics(name, count if last else width, last, task, metadata, shared)
+        is_decoder = metadata.get("head") == "RTDETRDecoder" or ("head" not in metadata and parts)
+        if form and width == 6 and is_decoder:
+            return replace(form, name=_RT_DETR, code="middle", in_parts=True)
+        return form
     where = _columns(name, boxes=4, objectness=1, scores=width - 5 - masks, weights=masks) | shared
     if each and width > 5 + masks:
         if each == 3:
@@ -183,6 +190,9 @@ def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any])
         x, _, side = cells(size, strides).T  # a decoded x is near that of its cell
         code = "middle" if np.corrcoef(values[0, :, 0], x * side)[0, 1] > 0.7 else "yolox"
         return Form("YOLOX", where, code, overlaps=True, pixels=_BYTES)
+    if width == 6 and parts:
+        found = "the boxes are parts of the picture, perhaps as of Ultralytics' RT-DETR (detect)"
+        raise _question("task", found, "export corners in pixels")
     if width == 6:
         return Form("boxes, score and class", _columns(name, boxes=4, scores=1, labels=1))
     if width in (7, 57):
@@ -218,7 +228,7 @@ def _ultralytics(
     rest = total - sum(columns.values())
     if task == "detect" and not last and classes > 2 and rest == classes - 2:
         where = _columns(name, boxes=4, scores=classes)
-        return Form("Ultralytics RT-DETR", where, "middle", in_parts=True)
+        return Form(_RT_DETR, where, "middle", in_parts=True)
     point = 2 if rest % 3 else 3
     if "kpt_shape" in metadata:
         point = ast.literal_eval(str(metadata["kpt_shape"]))[1]
