@@ -362,3 +362,38 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         assert form not in ASKED
         (found,) = network(np.zeros((1, 3, *SIZE), np.float32))
         check_known(form, found)
+
+
+def test_words_that_do_not_fit_are_told(tmp_path):
+    for form, words, said in (
+        ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
+        (
+            "detect",
+            {"task": "boxes"},
+            "`task` must be one of detect, pose, obb, segment, got boxes",
+        ),
+        ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
+        ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
+    ):
+        path, _ = written(tmp_path, form)
+        with pytest.raises(ValueError, match=said):
+            OnnxNetwork(path, **words)
+
+
+def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):
+    for form, count in (("detect", 80), ("detect without task", 80), ("own", 0), ("DETR", 80)):
+        (tmp_path / form / "onnx").mkdir(parents=True)
+        path, words = written(tmp_path / form / "onnx", form)
+        config = tmp_path / form / "onnx/config.json"
+        if config.is_file():
+            config.rename(tmp_path / form / "config.json")
+        network = OnnxNetwork(path, **words)
+        assert network.names == dict(list(NAMES.items())[:count])
+
+
+def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
+    seven = np.array([[0.0, 0.5, 0.1, 0.1, 0.1, 0.15, 0.05]], np.float32)  # as of emotions
+    pooled = np.zeros((1, 1, 5, 7), np.float32)  # a map of a 32nd
+    for value, kind in ((seven, "numbers"), (pooled, "maps")):
+        path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
+        assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
