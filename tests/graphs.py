@@ -1,5 +1,6 @@
 """Small networks in ONNX files whose answers are known."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,7 @@ OUTPUTS = {
     "numbers": ("float[B,K] logits", "logits = Identity(light)"),
     "undecoded": (
         "float[B,4,K] output0",
-        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 7]>() "
+        "box2 = Unsqueeze(box, a2) shape = Constant<value_ints=[1, 1, 11]>() "
         "output0 = Expand(box2, shape)",
     ),
     "boxes of other shape": (
@@ -122,18 +123,54 @@ def write_graph(
 
 def write_constants(path: Path, size: tuple[int, int], **outputs: np.ndarray) -> Path:
     """Writes a network of pictures (1, 3, H, W) that always gives the same outputs."""
-    nodes = [
-        helper.make_node("Constant", [], [name], value=numpy_helper.from_array(value))
-        for name, value in outputs.items()
-    ]
-    declared = [
-        helper.make_tensor_value_info(
-            name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
-        )
-        for name, value in outputs.items()
-    ]
-    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, *size])
-    graph = helper.make_graph(nodes, "network", [images], declared)
+    return write_detector(path, size, outputs)
+
+
+def write_detector(
+    path: Path, size: tuple[int, int], outputs: Mapping[str, np.ndarray], *, batch: int | str = 1,
+    metadata: Mapping[str, object] | None = None, sized: str | None = None, masked: bool = False,
+) -> Path:  # fmt: skip
+    """Writes a network of pictures (B, 3, H, W) that always gives the same outputs (1 or B, …).
+
+    Args:
+        sized: the output that `orig_target_sizes`, an input (B, 2) of widths and heights,
+            multiplies. masked: whether there is an input `pixel_mask`.
+    """
+    inputs = [helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, *size])]
+    nodes, declared = [], []
+    if sized is not None:
+        of = helper.make_tensor_value_info("orig_target_sizes", TensorProto.INT64, [batch, 2])
+        inputs.append(of)
+        nodes += onnx.parser.parse_graph("""g (int64[B,2] orig_target_sizes) => (float[B,1,4] by) {
+            sides = Cast<to=1>(orig_target_sizes) four = Concat<axis=1>(sides, sides)
+            middle = Constant<value_ints=[1]>() by = Unsqueeze(four, middle) }""").node
+    if masked:
+        shape = [batch, 64, 64]
+        inputs.append(helper.make_tensor_value_info("pixel_mask", TensorProto.INT64, shape))
+    for number, (name, value) in enumerate(outputs.items()):
+        kind = helper.np_dtype_to_tensor_dtype(value.dtype)
+        first = "value" if name == sized else name
+        if batch == "B" and value.ndim:
+            one, to = f"one{number}", f"to{number}"
+            rest = numpy_helper.from_array(np.array(value.shape[1:], np.int64))
+            constant = numpy_helper.from_array(value)
+            nodes += [
+                helper.make_node("Shape", ["images"], [f"n{number}"], start=0, end=1),
+                helper.make_node("Constant", [], [f"k{number}"], value=rest),
+                helper.make_node("Concat", [f"n{number}", f"k{number}"], [to], axis=0),
+                helper.make_node("Constant", [], [one], value=constant),
+            ]
+            nodes.append(helper.make_node("Expand", [one, to], [first]))
+        else:
+            constant = numpy_helper.from_array(value)
+            nodes.append(helper.make_node("Constant", [], [first], value=constant))
+        if name == sized:
+            like = helper.make_node("Cast", ["by"], ["as"], to=kind)
+            nodes += [like, helper.make_node("Mul", ["value", "as"], [name])]
+        shape = [batch, *value.shape[1:]] if batch == "B" and value.ndim else value.shape
+        declared.append(helper.make_tensor_value_info(name, kind, shape))
+    graph = helper.make_graph(nodes, "network", inputs, declared)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    helper.set_model_props(model, {key: str(value) for key, value in (metadata or {}).items()})
     onnx.save(model, path)
     return path

@@ -565,7 +565,7 @@ def test_any_boxes_are_carried(table):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: boxes.carry(np.zeros(4), same), r"boxes must have shape \(K, 4\), got \(4,\)"),
+        (lambda: boxes.carry(np.zeros(4), same), r"have shape \(K, 4\) or \(K, 5\), got \(4,\)"),
         (lambda: boxes.clip(np.zeros((2, 5)), (3, 3)), r"got \(2, 5\)"),
         (lambda: boxes.carry_points(np.zeros(3), same), r"\(\.\.\., 2\), got \(3,\)"),
         (lambda: boxes.carry_polygon(np.zeros(6), same), r"\(P, 2\), got \(6,\)"),

@@ -34,12 +34,14 @@ def like(given: Any, value: np.ndarray) -> Any:
     return value.astype(dtype, copy=False) if both_float else value
 
 
-def table_of(boxes: Any) -> np.ndarray:
+def table_of(boxes: Any, columns: tuple[int, ...] = (4, 5)) -> np.ndarray:
+    """Boxes as an array of upright ones, (K, 4), or of turned ones, (K, 5)."""
     table = floats(boxes)
     if table.shape == (0,):  # of an empty list
         table = table.reshape(0, 4)
-    if table.ndim != 2 or table.shape[1] != 4:
-        raise ValueError(f"boxes must have shape (K, 4), got {shape_of(table)}")
+    if table.ndim != 2 or table.shape[1] not in columns:
+        known = " or ".join(f"(K, {count})" for count in columns)
+        raise ValueError(f"boxes must have shape {known}, got {shape_of(table)}")
     return table
 
 

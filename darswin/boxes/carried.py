@@ -1,5 +1,6 @@
 """Boxes, points, polygons and masks through a map of points."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,21 +16,27 @@ from darswin.boxes.arrays import (
     to_numpy,
 )
 from darswin.boxes.overlap import clip
-from darswin.boxes.regions import box_of, shown_parts
+from darswin.boxes.regions import Part, box_of, shown_parts
+from darswin.boxes.turned import angle_around, frames_of, rotation
 
 _COUNT, FINELY = 72, 288  # points of an ellipse, and of one that is cut
 _BETWEEN = 33  # points at which the end of a curve is looked for
 
 
+def _circle(angles: np.ndarray) -> np.ndarray:
+    return np.stack((np.cos(angles), np.sin(angles)), -1)
+
+
 def _shares(count: int) -> np.ndarray:
-    """The points of the ellipse inside a box are the product of the box and this, (4, 2·count)."""
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    shares = np.stack((np.cos(angles), np.sin(angles)), -1)[..., None] / 2 + 0.5
-    both = np.concatenate(((1 - shares) * np.eye(2), shares * np.eye(2)), -1)
-    return both.reshape(2 * count, 4).T
+    """The points of an ellipse are the product of its half axes and its middle, the rows of (2, 3),
+    and this, (6, 2·count)."""
+    circle = _circle(np.linspace(0, 2 * np.pi, count, endpoint=False))
+    each = np.concatenate((circle.T, np.ones((1, count))))
+    return (np.eye(2)[:, None, None] * each[..., None]).reshape(6, 2 * count)
 
 
 _ELLIPSE = _shares(_COUNT)
+_CIRCLE = _circle(np.linspace(0, 2 * np.pi, _COUNT, endpoint=False))
 _STEP = 4.0  # px: a curve differs less than 0.1 px from its chords, if its radius is above 20 px
 _MOST_POINTS = 100_000  # of a polygon: a corner that is far away must not fill the memory
 
@@ -40,48 +47,80 @@ def carry(
     """Carries boxes through a point map, by the ellipses inside them.
 
     The ellipse of a thing that is seen in part ends where the map does, and at the borders of the
-    new picture. Its new box is that of what is left.
+    new picture. Its new box is that of what is left. The new box of a turned one is turned as the
+    ellipse is that its ellipse becomes.
 
     Args:
-        boxes: (K, 4).
+        boxes: (K, 4 or 5).
         points_map: called twice for all boxes, and more often if boxes are cut.
         size: (H, W) of the new picture. Without it, boxes may go on beyond the picture.
 
     Returns:
-        The boxes of what is seen, (K, 4), NaN if nothing is; and the visible shares of the areas of
-        the ellipses, (K,), 0 to 1.
+        The boxes of what is seen, (K, 4 or 5), NaN if nothing is; and the visible shares of the
+        areas of the ellipses, (K,), 0 to 1.
 
     Raises:
         ValueError: boxes of another shape.
     """
     table = table_of(boxes)
     # Reductions along a contiguous axis are several times as fast.
-    x, y = np.ascontiguousarray(np.moveaxis(through(points_map, ellipses(table)), -1, 0))
-    carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1) if len(table) else table
+    found = through(points_map, ellipses(table))
+    x, y = np.ascontiguousarray(np.moveaxis(found, -1, 0))
+    carried = np.zeros((0, 4))
+    if len(table):
+        carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1)
     whole = ~np.isnan(carried[:, 0])
     if size is not None:
         whole &= (clip(carried, size) == carried).all(1)
         whole &= (np.abs(np.diff(x, append=x[:, :1])) <= size[1] / 2).all(1)  # not at a seam
+    turn = None
+    if table.shape[1] == 5:
+        axes = (found - found[:, :1]).mT @ _CIRCLE  # of the affine map that is nearest
+        turn = np.where(axes.any((1, 2)), angle_around(axes), table[:, 4])
+        x, y = np.moveaxis(found @ rotation(turn), -1, 0)
     if whole.any():
-        carried[whole] = _ends(table[whole], points_map, x[whole], y[whole])
+        frame = None if turn is None else turn[whole]
+        carried[whole] = _ends(table[whole], points_map, x[whole], y[whole], frame)
     visible = np.ones(len(table))
     cut = np.flatnonzero(~whole)
     outlines = [*ellipses(table[cut], FINELY)]
     shown = shown_parts(outlines, lambda points: through(points_map, points), size)
     for k, (parts, share) in zip(cut, shown, strict=True):
-        carried[k], visible[k] = box_of([part.new for part in parts]), share
+        new = [part.new for part in parts]
+        if turn is not None:
+            turn[k] = _turn_of(parts, table[k])
+            new = [points @ rotation(turn[k]) for points in new]
+        carried[k], visible[k] = box_of(new), share
+    if turn is not None:
+        low, high = carried[:, None, :2], carried[:, None, 2:]
+        middle = (low + high) / 2 @ rotation(turn).mT
+        carried = np.concatenate((middle[:, 0], (high - low)[:, 0], turn[:, None]), 1)
     return like(boxes, carried), like(boxes, visible)
 
 
-def _ends(table: np.ndarray, points_map: PointMap, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The boxes of curves whose points are x and y (K, P): each of the four ends is looked for
-    between the neighbours of the outermost point, since a curve may have corners."""
+def _turn_of(parts: Sequence[Part], box: np.ndarray) -> float:
+    """The angle of the ellipse in a turned box, (5,), of which a map shows parts."""
+    if not parts:
+        return np.nan
+    old, new = (np.concatenate(of) for of in zip(*parts, strict=True))
+    moves, *_ = np.linalg.lstsq(old - old.mean(0), new - new.mean(0))
+    return angle_around(moves.T @ frames_of(box)[1][None]).item()
+
+
+def _ends(
+    table: np.ndarray, points_map: PointMap, x: np.ndarray, y: np.ndarray, turn: np.ndarray | None
+) -> np.ndarray:
+    """The boxes of curves whose points are x and y (K, P), turned by the angles `turn`: each of
+    the four ends is looked for between the neighbours of the outermost point, since a curve may
+    have corners."""
     outermost = np.stack((x, y, -x, -y)).argmin(2)  # (4, K)
     around = outermost[..., None] + np.linspace(-1, 1, _BETWEEN)
     angle = 2 * np.pi / x.shape[1] * around
-    middle, half = (table[:, :2] + table[:, 2:]) / 2, (table[:, 2:] - table[:, :2]) / 2
-    circle = np.stack((np.cos(angle), np.sin(angle)), -1)
-    found = through(points_map, middle[:, None] + half[:, None] * circle)
+    middle, axes = frames_of(table)
+    circle, (w, h) = _circle(angle), np.moveaxis(axes, -1, 0)[:, :, None]
+    found = through(points_map, middle[:, None] + circle[..., :1] * w + circle[..., 1:] * h)
+    if turn is not None:
+        found = found @ rotation(turn)
     x, y = np.moveaxis(np.where(np.isnan(found), np.inf, found), -1, 0)
     x_high, y_high = np.moveaxis(np.where(np.isnan(found), -np.inf, found), -1, 0)
     return np.stack((_least(x[0]), _least(y[1]), -_least(-x_high[2]), -_least(-y_high[3])), 1)
@@ -100,9 +139,9 @@ def _least(values: np.ndarray) -> np.ndarray:
 
 def ellipses(boxes: Array, count: int = _COUNT) -> np.ndarray:
     """Points of the ellipses inside boxes, (K, count, 2); NaN for boxes that are not finite."""
-    table = table_of(boxes)
-    shares = _ELLIPSE if count == _COUNT else _shares(count)
-    return (np.where(np.isfinite(table), table, np.nan) @ shares).reshape(-1, count, 2)
+    middle, axes = frames_of(table_of(boxes))
+    rows = np.concatenate((axes, middle[..., None]), -1).reshape(-1, 6)
+    return (rows @ (_ELLIPSE if count == _COUNT else _shares(count))).reshape(-1, count, 2)
 
 
 def carry_points(points: Array, points_map: PointMap) -> Any:

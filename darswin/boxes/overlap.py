@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from darswin.boxes.arrays import Array, floats, like, shape_of, table_of, to_numpy
+from darswin.boxes.turned import as_turned, common_area, upright
 
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
@@ -12,13 +13,15 @@ _ROWS = 128  # boxes that are compared with all worse ones at once
 def clip(boxes: Array, size: tuple[int, int]) -> Any:
     """Cuts boxes (K, 4) at the borders of a picture of (H, W); NaN stays NaN."""
     height, width = size
-    return like(boxes, np.clip(table_of(boxes), 0.0, [width, height, width, height]))
+    return like(boxes, np.clip(table_of(boxes, (4,)), 0.0, [width, height, width, height]))
 
 
 def iou(boxes: Array, others: Array) -> Any:
-    """The intersection over the union of each box (K, 4) with each of the others (L, 4): (K, L),
-    0 for boxes that are NaN or have no area."""
+    """The intersection over the union of each box (K, 4 or 5) with each of the others (L, 4 or 5):
+    (K, L), 0 for boxes that are NaN or have no area."""
     a, b = table_of(boxes)[:, None], table_of(others)[None]
+    if a.shape[2] != b.shape[2]:
+        a, b = as_turned(a), as_turned(b)
     common = _common(a, b)
     return like(boxes, _ratio(common, _area(a) + _area(b) - common))
 
@@ -33,7 +36,7 @@ def merge(
     as the whole of a thing covers the part that another tile saw.
 
     Args:
-        boxes: (K, 4). scores: (K,). labels: (K,), the classes.
+        boxes: (K, 4 or 5). scores: (K,). labels: (K,), the classes.
 
     Returns:
         The indices of the kept detections, the best first. NaN boxes and scores are left out.
@@ -54,7 +57,7 @@ def merge(
     order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
     table, label = table[order], label[order]
     area, kept = _area(table), np.ones(len(order), bool)
-    x0, x1 = np.ascontiguousarray(table[:, ::2].T)
+    x0, x1 = np.ascontiguousarray(upright(table)[:, ::2].T)
     for start in range(0, len(order), _ROWS):
         one, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
         meet = label[one] == label[rest]
@@ -76,11 +79,20 @@ def merge(
 
 
 def _area(boxes: np.ndarray) -> np.ndarray:
-    return _common(boxes, boxes)
+    if boxes.shape[-1] == 4:
+        return _common(boxes, boxes)
+    return np.maximum(boxes[..., 2], 0) * np.maximum(boxes[..., 3], 0)
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The area of the intersection of boxes."""
+    if a.shape[-1] == 5:
+        near = _common(upright(a), upright(b))
+        meet = near > 0
+        one, other = (np.broadcast_to(table, (*meet.shape, 5))[meet] for table in (a, b))
+        # No more than either, which it is but for rounding.
+        near[meet] = np.minimum(common_area(one, other), np.minimum(_area(one), _area(other)))
+        return np.where(meet, near, 0)
     low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
     sides = np.maximum(high - low, 0)
     return sides[..., 0] * sides[..., 1]  # several times as fast as `prod`

@@ -23,7 +23,7 @@ class SphericalBoxes(NamedTuple):
 
 
 def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
-    """Boxes (K, 4) of a picture as directions and angles, by the ellipses inside them.
+    """Boxes (K, 4 or 5) of a picture as directions and angles, by the ellipses inside them.
 
     Args:
         to_rays: a function from points (..., 2), in darswin's pixels, to rays (..., 3), NaN or 0

@@ -1,23 +1,35 @@
 """Predictions of a network in an ONNX file, which sees the pictures through a view."""
 
 import io
+import json
 import math
 import re
+import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
 
 from darswin import boxes
 from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_overlay
+from darswin.cli.found import (
+    coco_results,
+    drawn,
+    entries,
+    in_picture,
+    rounded,
+    without_overlaps,
+    yolo_lines,
+)
 from darswin.cli.names import read_names
 from darswin.cli.views import named_view
 from darswin.frames import Sampler
+from darswin.frames.forms import Pixels
 from darswin.frames.onnx import Detections, OnnxNetwork
 from darswin.lens import Lens
 from darswin.ops.checks import per_channel
@@ -26,9 +38,9 @@ from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
 from darswin.views import PlainView, Remap
-from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
+from darswin.viz.pixels import label_image, overlay, palette
 
-VIEW, THRESHOLD = "mercator", 0.3
+VIEW, THRESHOLD, RESULTS = "mercator", 0.3, "coco.json"
 
 
 class Logits(UserWarning):
@@ -102,34 +114,51 @@ class NetworkAnswers(Answers):
         fov_deg: float | None = None, up: Sequence[float] | None = None,
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
-        top: int | None = None,
+        top: int | None = None, task: Any = None, scores: Any = None,
+        format: Literal["json", "coco", "yolo"] | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
         check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")
         check_statistics(mean, std)
         check("size", size, size is None or min(size) >= 1, "at least 1,1")
         self.labels = None if labels is None else read_names(labels)
-        make = partial(
-            named_view, "view", view or VIEW, fov_deg=fov_deg, up=up, mean=mean or (0.0,),
-            std=std or (1.0,),
-        )  # fmt: skip
+        make = partial(named_view, "view", view or VIEW, fov_deg=fov_deg, up=up)
         # The network says how large its pictures are, but the view how many there are.
         try:
-            self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest)
+            self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest, task, scores)
         except ModuleNotFoundError as error:  # of onnxruntime, and says how to install it
             raise ValueError(str(error)) from error
         super().__init__(self.network.channels)
         if self.network.output == "uint8" and (mean or std):
             text = f"{network} takes pixels of uint8: leave `mean` and `std` out"
             raise naming(ValueError(text), "mean", "std")
-        self.view = make(self.network.size)
+        if format is not None and self.network.kind != "detections":
+            text = f"`format` is for detections, but {network} is a network for {self.network.kind}"
+            raise naming(ValueError(text), "format")
+        pixels = self.network.pixels
+        if mean or std or len(pixels.mean) not in (1, self.channels):
+            pixels = Pixels(tuple(mean or (0.0,)), tuple(std or (1.0,)), pixels.channels)
+        pixels = pixels._replace(channels=channels or pixels.channels)
+        self.view = make(self.network.size, mean=pixels.mean, std=pixels.std)
         self._mean, self._std = (
             per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
         )
-        self._step = -1 if channels == "bgr" else 1
+        self._step = -1 if pixels.channels == "bgr" else 1
+        self._format, self._results = format, list[dict[str, Any]]()
+        if self.network.form is not None:
+            print(f"darswin: {network}: {self._said(pixels)}", file=sys.stderr)
         self._top, asked = top or TOP, top is not None or labels is not None
         self._classes = self._class_outputs() if asked else []
         self._boxes = Boxes()
+
+    def _said(self, pixels: Pixels) -> str:
+        """What is read of the file, and what it is given."""
+        names = f", {len(self.network.names)} names of classes" if self.network.names else ""
+        given = "uint8"
+        if self.network.output == "image":
+            mean, std = (",".join(f"{v:.4g}" for v in part) for part in (pixels.mean, pixels.std))
+            given = f"(pixel/255 - mean) / std, mean {mean}, std {std}"
+        return f"detections ({self.network.form}{names}); pixels are {pixels.channels}, {given}"
 
     def _class_outputs(self) -> list[str]:
         """The outputs that are numbers of classes, if these were asked for."""
@@ -189,45 +218,40 @@ class NetworkAnswers(Answers):
         self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
     ) -> dict[str, Any]:
         """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
-        parts = []
+        if self.network.overlaps:
+            found = [without_overlaps(one) for one in found]
         self._boxes.add(found)
-        for tile, (inner, *others) in zip(seen.remap.tiles, found, strict=True):
-            carried, visible, _ = tile.boxes_to_image(inner)
-            kept = visible > 0
-            parts.append([values[kept] for values in (carried, visible, *others)])
-        carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
-        if len(found) == 1:  # a network knows best which of its own boxes are one thing
-            order = np.argsort(-scores, kind="stable")
-        else:
-            order = boxes.merge(carried, scores, labels)
-        carried, visible, scores, labels = (v[order] for v in (carried, visible, scores, labels))
-
-        there = boxes.spherical(carried, seen.remap.rays_of_image)
-        names = [self._name(label) for label in labels.tolist()]
-        colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in labels.tolist()]
-        texts = [f"{name} {score:.2f}" for name, score in zip(names, scores, strict=True)]
-        picture = draw_boxes(image, carried, texts, colors)
+        things = in_picture(seen.remap, found)
+        there = boxes.spherical(things.get("turned", things["boxes"]), seen.remap.rays_of_image)
+        names = [self._name(label) for label in things["labels"].tolist()]
+        texts = [f"{name} {score:.2f}" for name, score in zip(names, things["scores"], strict=True)]
         columns = {
             "label": names,
-            "score": _rounded(scores, 4),
-            "box": _rounded(carried, 2),
-            "visible": _rounded(visible, 4),
+            "score": rounded(things["scores"], 4),
+            "box": rounded(things["boxes"], 2),
+            "visible": rounded(things["visible"], 4),
             **{
-                f"{angle}_deg": _rounded(np.degrees(getattr(there, angle)), 3)
+                f"{angle}_deg": rounded(np.degrees(getattr(there, angle)), 3)
                 for angle in ("azimuth", "elevation", "width", "height")
             },
-            "ray": _rounded(there.ray, 6),
+            "ray": rounded(there.ray, 6),
         }
-        entries = [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ]
         name = file_of(entry, self._names)
-        return {"overlay": write_overlay(self._out, name, picture), "detections": entries}
+        self._results += coco_results(name, things) if self._format == "coco" else []
+        if self._format == "yolo":
+            lines = yolo_lines((image.shape[0], image.shape[1]), things)
+            replace_file(self._out / f"labels/{name}.txt", lines)
+        picture = write_overlay(self._out, name, drawn(image, things, texts))
+        return {"overlay": picture, "detections": entries(things, columns)}
+
+    def flush(self) -> None:
+        if self._format == "coco" and self._results:
+            replace_file(self._out / RESULTS, json.dumps(self._results, allow_nan=False))
 
     def _name(self, label: int) -> str | int:
-        """The name of a class, or its number if there are no names."""
+        """The name of a class by `labels` or the file of the network, or else its number."""
         if self.labels is None:
-            return label
+            return self.network.names.get(label, label)
         if label not in self.labels:
             count = f"{len(self.labels)} names, from {min(self.labels)} to {max(self.labels)}"
             text = f"{self.network.path} found class {label}, but `labels` has {count}, without it"
@@ -290,10 +314,3 @@ class NetworkAnswers(Answers):
             key = "score"  # of each class on its own
         best = np.argsort(-values, kind="stable")[: self._top]
         return [{"class": self._name(int(k)), key: round(float(values[k]), 6)} for k in best]
-
-
-def _rounded(values: Any, digits: int) -> Any:
-    """Numbers in lists for JSON, which has no NaN."""
-    if np.ndim(values):
-        return [_rounded(value, digits) for value in values]
-    return None if math.isnan(values) else round(values, digits)

@@ -4,6 +4,7 @@ is written to, and the files that cannot be read.
 
 import json
 import os
+import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from darswin.lens import Lens
 from darswin.utils.files import check_is_file, replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import with_flags
-from darswin.utils.video import is_video
+from darswin.utils.video import is_stream, is_video, stream_name
 
 Made = TypeVar("Made")
 
@@ -29,7 +30,7 @@ class File(NamedTuple):
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
     """The files at the paths; a folder stands for all pictures and videos in it."""
-    files = []
+    files: list[File] = []
     for path in paths:
         names = [str(path)]
         if os.path.isdir(path) and not _is_picture(path):
@@ -37,7 +38,8 @@ def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> l
             names = [n for n in below if leave_out is None or not is_below(n, leave_out)]
             for name in names:
                 check_is_file(name)
-        files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
+        videos = (is_stream(n) or (not _is_picture(n) and is_video(n)) for n in names)
+        files += map(File, names, videos)
     return files
 
 
@@ -110,9 +112,13 @@ def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[
 
 def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
     """The paths of pictures and videos relative to the common folder of all arguments."""
+    streams = [stream_name(name) for name, _ in files if is_stream(name)]
+    files = [file for file in files if not is_stream(file[0])]
+    paths = [path for path in paths if not is_stream(path)] or ["."]
     folders = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
     root = os.path.commonpath(folders)
-    return {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+    found = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+    return found | {name: re.sub(r"\W+", "_", name) for name in streams}
 
 
 def claim_folder(out: str | None, record: str) -> Path:

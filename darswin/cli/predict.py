@@ -27,6 +27,7 @@ from darswin.cli.pictures import (
 )
 from darswin.compat import load_official
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.frames.recognise import TASKS
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
@@ -34,22 +35,24 @@ from darswin.models.saving import ModelCard, NoCardError, load_model, model_file
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.parameters import check, naming
-from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
-from darswin.utils.video import read_frames
+from darswin.utils.video import is_stream, read_frames, read_stream, stream_name
 
 ANSWERS = "predictions.json"
+AnyTask = Literal["classification", "segmentation", "distance", "detect", "pose", "obb", "segment"]
 
 
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
     model: str | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None, task: Task | None = None, top: int | None = None,
+    coefficients: Coefficients | None = None, task: AnyTask | None = None, top: int | None = None,
     every: int = 1, out: str | None = None, network: str | None = None, view: str | None = None,
     size: tuple[int, int] | None = None, fov_deg: float | None = None,
     up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
     std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
     threshold: float | None = None, labels: str | None = None,
+    scores: Literal["softmax", "sigmoid"] | None = None,
+    format: Literal["json", "coco", "yolo"] | None = None,
 ) -> list[dict]:  # fmt: skip
     """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
     or runs any network in an ONNX file, such as a detector, on a view of them.
@@ -60,7 +63,9 @@ def predict(
     entry gives the speed in frames per second.
 
     Args:
-        paths: image files, videos, and folders of them. A model that comes with darswin has an
+        paths: image files, videos, and folders of them; or a camera, by its number, such as 0, its
+            device, or an address such as rtsp://…, of which each newest frame is taken until
+            Ctrl-C. A model that comes with darswin has an
             example picture, which is used if no paths are given.
         lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
             as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
@@ -76,7 +81,8 @@ def predict(
             classes are numbers.
         camera: the name or number of the camera, if the calibration has several.
         coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
-        task: the task that the model must have. Another model is an error.
+        task: the task that the model must have. Another model is an error. Of a network of
+            Ultralytics whose file lost its metadata: detect, pose, obb or segment.
         top: the number of classes to list for each image. The default is 5. A network in an ONNX
             file then gives classes in place of numbers.
         every: the step between the frames of a video that are predicted; 1 predicts all.
@@ -84,12 +90,12 @@ def predict(
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
             in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json. For a
-            network, it gets overlays/NAME.jpg with boxes, or maps/OUTPUT/NAME.npy, and
+            network, it gets overlays/NAME.jpg with what was found, or maps/OUTPUT/NAME.npy, and
             predictions.json; the numbers of a network without boxes and maps are printed.
-        network: in place of a run, an ONNX file of any network. Its outputs are boxes, scores and
-            labels by these names, one output (B, N, 6) of x0, y0, x1, y1, score and class, maps
-            (B, K, H, W) of the size of the view or of a whole fraction of it, or numbers (B, K). It
-            needs onnxruntime, of the extra onnx.
+        network: in place of a run, an ONNX file of any network: a detector as the exporters of
+            YOLO, RT-DETR, RF-DETR, DETR, torchvision and others write it, with masks, keypoints and
+            turned boxes; maps (B, K, H, W) of the size of the view or of a whole fraction of it; or
+            numbers (B, K). It needs onnxruntime, of the extra onnx.
         view: what the network sees of the pictures, by its lens: the name of a view of
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
@@ -99,17 +105,26 @@ def predict(
         up: the direction away from gravity, as x right, y down and z forward of the camera. The
             default is the top of the picture, 0,-1,0.
         mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
-            one for each channel. The default is 0.
-        std: the same for std. The default is 1. Divide numbers for pixels from 0 to 255 by 255.
-        channels: the order of colours that the network expects. The default is rgb.
+            one for each channel. The default is that of the form of a detector, which is printed,
+            and else 0, also if only std is given.
+        std: the same for std, else 1. Divide numbers for pixels from 0 to 255 by 255.
+        channels: the order of colours that the network expects. The default is that of the form of
+            a detector, and else rgb.
         threshold: the lowest score of boxes. The default is 0.3.
         labels: a file with the names of the network's classes: a text file, whose line k names
             class k, from 0, and whose empty lines are no classes; JSON or YAML with a list or with
-            {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt).
+            {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt). The default
+            is the names in the file of the network, if it has any.
+        scores: what makes probabilities of the logits of a DETR of transformers, if no config.json
+            is beside the file.
+        format: what else to write of detections, beside predictions.json: coco writes coco.json,
+            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, place and
+            score in each line.
     """
     options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
-        "channels": channels, "threshold": threshold, "labels": labels,
+        "channels": channels, "threshold": threshold, "labels": labels, "scores": scores,
+        "format": format,
     }  # fmt: skip
     if network is None and (given := [k for k, value in options.items() if value is not None]):
         raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")
@@ -135,14 +150,16 @@ def predict(
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
-    check_paths(paths)
+    check_paths([path for path in paths if not is_stream(path)])
     if network is None:
         kind, make = _of_model(weights, TOP if top is None else top)
     else:
         from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
 
-        through = NetworkAnswers(network, **options, top=top)
+        told = task if task in TASKS else None
+        through = NetworkAnswers(network, **options, top=top, task=told)
         kind, make = through.network.kind, through.into
+        task = None if told and kind == "detections" else task
     if task not in (None, kind):
         raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
     if top is not None and kind not in ("classification", "numbers"):
@@ -203,14 +220,19 @@ def _of_model(
 
 
 def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> None:
-    """Predicts the frames of a video, and prints the speed."""
+    """Predicts the frames of a video or a camera, and prints the speed. Ctrl-C ends a camera."""
+    live = is_stream(name)
+    frames_of, said = (read_stream, stream_name(name)) if live else (read_frames, name)
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
-        for frame in read_frames(name, answers.channels, every):
+        for frame in frames_of(name, answers.channels, every):
             taken_with = _lens(lenses, name, frame.image, frame.orientation)
-            entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
+            entry = {"video": said, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
+    except KeyboardInterrupt:
+        if not live:
+            raise
     finally:
         answers.flush()
         seconds, network = time.perf_counter() - start, answers.seconds - before
@@ -220,9 +242,9 @@ def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> Non
                 "frames_per_second": round(frames / seconds, 1),
                 "network_frames_per_second": round(frames / network, 1),
             }
-            answers.found.append({"video": name, **speed})
+            answers.found.append({"video": said, **speed})
             print(
-                f"darswin: {name}: {frames} frames at {frames / seconds:.1f} frames/s; "
+                f"darswin: {said}: {frames} frames at {frames / seconds:.1f} frames/s; "
                 f"the network alone: {frames / network:.1f} frames/s",
                 file=sys.stderr,
             )

@@ -2,37 +2,32 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from darswin.frames.forms import RGB, Detections, Form, decode
+from darswin.frames.recognise import SCORES, TASKS, form_of, names_of
 from darswin.utils.extras import lack
 from darswin.utils.files import check_is_file
 from darswin.utils.parameters import check, naming
+from darswin.utils.text import parse_json, read_text
 
 __all__ = ["Detections", "OnnxNetwork"]
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _CHANNELS = (1, 3)
-_DETECTIONS = ("boxes", "scores", "labels")
+# The inputs beside the pictures, and their types.
+_SIZES = ("orig_target_sizes", "pixel_mask")
+_INTEGERS = {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(bool)": np.bool_}
 _KNOWN = (
-    "known are boxes (B, N, 4), scores (B, N) and labels (B, N) by these names; one output "
-    "(B, N, 6) of x0, y0, x1, y1, score and class; maps (B, K, H, W) of the size of the picture or "
-    "of a whole fraction of it; and numbers (B, K). A network that needs a decoder must have it in "
-    "its graph"
+    "known are the forms of public detectors, which the how-to about detectors lists; maps "
+    "(B, K, H, W) of the size of the picture or of a whole fraction of it; and numbers (B, K). "
+    "Another detector needs its decoder in the graph: boxes (B, N, 4), scores (B, N) and labels "
+    "(B, N) by these names, or one output (B, N, 6) of x0, y0, x1, y1, score and class"
 )
-
-
-class Detections(NamedTuple):
-    """What a detector finds in a picture.
-
-    Shapes: boxes (K, 4), the corners x0, y0, x1, y1 in px, where the picture covers (0, 0) to
-    (W, H); scores (K,); labels (K,), the numbers of the classes.
-    """
-
-    boxes: np.ndarray
-    scores: np.ndarray
-    labels: np.ndarray
 
 
 class OnnxNetwork:
@@ -43,22 +38,25 @@ class OnnxNetwork:
     detector, and otherwise a dict of the outputs: numbers (n, K), and maps (n, K, H/k, W/k) with a
     whole number k. Maps of integers, such as ids of classes, may lack K.
 
-    The graph has one input: pictures (B, C, H, W) or (B, H, W, C), or one picture without B; maps
-    then have the same order of axes. If the graph does not name its channels, they come first, and
-    are 3. The outputs of a detector are boxes, scores and labels by these names, (B, N, …), or
-    (N, …) for one picture; or one output (B, N, 6) of x0, y0, x1, y1, score and class. Boxes are in
-    pixels of the picture. To see what the outputs are, the network runs once on black pictures.
+    The graph takes pictures (B, C, H, W) or (B, H, W, C), or one picture without B; maps then have
+    the same order of axes. If the graph does not name its channels, they come first, and are 3. An
+    input `orig_target_sizes` gets the size of the pictures, and `pixel_mask` ones. The outputs of a
+    detector may have any form of the public ones. Boxes are in pixels of the picture. To see what
+    the outputs are, the network runs once on black pictures.
 
     Args:
-        path: the ONNX file.
+        path: the ONNX file. A config.json of transformers beside it, or above its folder "onnx",
+            says what its outputs do not.
         size: (H, W) of the pictures. None means that of the graph, which must then have one.
         count: the usual number of pictures in a call. They are one batch if the network takes it.
         threshold: the lowest score of a detection. Others are left out.
+        task: detect, pose, obb or segment, of a file of Ultralytics that lost its metadata.
+        scores: softmax or sigmoid, which makes probabilities of the logits of transformers.
 
     Raises:
         ModuleNotFoundError: onnxruntime is not installed.
         ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
-            no known form, or the size is missing or not that of the graph.
+            no known form, or of several, or the size is missing or not that of the graph.
         FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
 
     Attributes:
@@ -66,19 +64,25 @@ class OnnxNetwork:
         output: the output of a `darswin.frames.Plan` that the network takes, "uint8" or "image".
         kind: "detections", "maps", or "numbers".
         shapes: the shapes of the outputs for one picture, by name; empty for a detector.
+        form: the name of a detector's form, or None. overlaps: whether several boxes show one
+            thing, and `darswin.boxes.merge(…, inside=1)` must keep the best.
+        names: the names of the classes, by their numbers, as far as the file has them.
+        pixels: what networks of this form expect: a named tuple of mean, std and channels.
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike,
-        size: tuple[int, int] | None = None,
-        count: int = 1,
-        threshold: float = 0.3,
-    ):
+        self, path: str | os.PathLike, size: tuple[int, int] | None = None, count: int = 1,
+        threshold: float = 0.3, task: Literal["detect", "pose", "obb", "segment"] | None = None,
+        scores: Literal["softmax", "sigmoid"] | None = None,
+    ):  # fmt: skip
         if (without := lack("onnx", ("onnxruntime",))) is not None:
             raise ModuleNotFoundError(without)
+        check("task", task, task in (None, *TASKS), f"one of {', '.join(TASKS)}")
+        check("scores", scores, scores in (None, *SCORES), f"one of {', '.join(SCORES)}")
         self.path, self.threshold = os.fspath(path), threshold
         self._session = _session(self.path)
+        self._metadata = self._read_metadata()
+        self.names = names_of(self._metadata)
         own, batch = self._read_input()
         if size is None and None in own:
             text = f"missing `size`: {self.path} takes pictures of any size, so choose one"
@@ -88,9 +92,17 @@ class OnnxNetwork:
             wanted = ",".join("any" if side is None else str(side) for side in own)
             check("size", ",".join(map(str, size)), fits, f"{wanted} for {self.path}")
         self.size: tuple[int, int] = size or own
+        self._form: Form | None = None
+        self._see = partial(form_of, size=self.size, metadata=self._metadata, task=task,
+                            scores=scores)  # fmt: skip
+        self._is_seen = False
         black = np.zeros((count, self.channels, *self.size), np.float32)
         self.batch = batch or (count if count > 1 and self._takes(black) else 1)
         found = self(black)
+        self._is_seen = True
+        self.form = None if self._form is None else self._form.name
+        self.overlaps = self._form is not None and self._form.overlaps
+        self.pixels = RGB if self._form is None else self._form.pixels
         self.kind: Literal["detections", "maps", "numbers"] = "detections"
         self.shapes: dict[str, tuple[int, ...]] = {}
         if isinstance(found, dict):
@@ -98,17 +110,30 @@ class OnnxNetwork:
             self.shapes = {name: values.shape[1:] for name, values in found.items()}
             self._check_heads()
 
+    def _read_metadata(self) -> dict[str, Any]:
+        """The metadata of the file, and the configuration of transformers beside it."""
+        found = dict(self._session.get_modelmeta().custom_metadata_map)
+        folder = Path(self.path).absolute().parent
+        file = (folder.parent if folder.name == "onnx" else folder) / "config.json"
+        if file.is_file() and "pred_boxes" in {put.name for put in self._session.get_outputs()}:
+            config = parse_json(read_text(file))
+            found |= {key: config[key] for key in ("model_type", "id2label") if key in config}
+        return found
+
     def _read_input(self) -> tuple[tuple[Any, Any], int | None]:
         """Reads the axes of the input in the graph. Returns its (H, W) and its batch, None for
         those that are free."""
-        first, *others = self._session.get_inputs()
+        puts = self._session.get_inputs()
+        sizes = [put for put in puts if put.name in _SIZES]
+        first, *others = [put for put in puts if put not in sizes] or puts
         axes = [side if isinstance(side, int) and side > 0 else None for side in first.shape]
         if others or first.type not in _TYPES or len(axes) not in (3, 4):
-            given = [f"{put.name} {_text(put.shape)} of {put.type}" for put in (first, *others)]
+            given = [f"{put.name} {_text(put.shape)} of {put.type}" for put in puts]
             raise ValueError(
                 f"{self.path} has the inputs {', '.join(given)}; it must have one, pictures "
-                "(B, C, H, W) or (B, H, W, C) of float or uint8"
+                "(B, C, H, W) or (B, H, W, C) of float or uint8, and may have " + ", ".join(_SIZES)
             )
+        self._more_inputs = sizes
         self._input, self._type, self._is_single = first.name, _TYPES[first.type], len(axes) == 3
         batch, *rest = [1] * self._is_single + axes
         self._is_last = rest[2] in _CHANNELS and rest[0] not in _CHANNELS
@@ -149,51 +174,50 @@ class OnnxNetwork:
         if self._is_last:
             pictures = np.moveaxis(pictures, 1, -1)
         batch = np.ascontiguousarray(pictures[0] if self._is_single else pictures, self._type)
+        puts = {self._input: batch} | self._sizes(len(pictures))
         try:
-            values = self._session.run(None, {self._input: batch})
+            values = self._session.run(None, puts)
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
             raise ValueError(f"onnxruntime cannot run {self.path}: {_line(error)}") from error
         outputs = {
             put.name: np.asarray(value)[None] if self._is_single else np.asarray(value)
             for put, value in zip(self._session.get_outputs(), values, strict=True)
         }
-        found: list[Any] | None = []
-        if all(value.dtype.kind in "biuf" for value in outputs.values()):
-            found = self._detections(outputs, len(pictures))
-            found = self._others(outputs, len(pictures)) if found is None else found
-        if not found:
+        try:
+            return self._found(outputs, len(pictures))
+        except ValueError as error:
             given = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
-            raise ValueError(f"{self.path} has the outputs {', '.join(given)}; {_KNOWN}")
+            text = f"{self.path} has the outputs {', '.join(given)}; {error}"
+            raise ValueError(text) from error
+
+    def _sizes(self, count: int) -> dict[str, np.ndarray]:
+        """The inputs beside the pictures, which tell their size."""
+        found = {}
+        for put in self._more_inputs:
+            if put.name == "pixel_mask":
+                axes = zip((count, *self.size), put.shape, strict=True)
+                value = np.ones([side if isinstance(side, int) else own for own, side in axes])
+            else:
+                value = np.tile(self.size[::-1], (count, 1))
+            found[put.name] = value.astype((_TYPES | _INTEGERS)[put.type])
         return found
 
-    def _detections(self, outputs: dict[str, np.ndarray], count: int) -> list[Any] | None:
-        """The detections in each of `count` pictures, [] if they have wrong shapes; None if the
-        network is no detector."""
-        named = {name.lower(): value for name, value in outputs.items()}
-        if named.keys() >= set(_DETECTIONS):
-            boxes, scores, labels = (named[name] for name in _DETECTIONS)
-            boxes = boxes[None] if boxes.ndim == 2 else boxes
-        else:
-            (table, *others) = outputs.values()
-            if others or table.ndim != 3 or table.shape[2] != 6:
-                return None
-            boxes, scores, labels = table[..., :4], table[..., 4], table[..., 5]
-        shape = boxes.shape[:2]
-        if boxes.shape != (count, *shape[1:], 4):
-            return []
-        if not scores.size == labels.size == boxes.size // 4:
-            return []
-        each = zip(boxes, scores.reshape(shape), labels.reshape(shape), strict=True)
-        return [self._kept(*one) for one in each]
-
-    def _kept(self, *found: np.ndarray) -> Detections:
-        """The detections of one picture whose score is high enough."""
-        keep = ~(found[1] < self.threshold)
-        boxes, scores, labels = (values[keep].astype(np.float64) for values in found)
-        self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
-        if (labels % 1).any():
-            raise ValueError(f"{self.path} finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
-        return Detections(boxes, scores, labels.astype(np.int64))
+    def _found(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
+        """What the outputs (B, …) of `count` pictures show."""
+        if any(value.dtype.kind not in "biuf" for value in outputs.values()):
+            raise ValueError(_KNOWN)
+        if self._form is None and not self._is_seen:
+            self._form = self._see(outputs)
+        if self._form is None:
+            if not (found := self._others(outputs, count)):
+                raise ValueError(_KNOWN)
+            return found
+        found = decode(self._form, outputs, count, self.size, self.threshold)
+        for boxes, scores, labels, *_ in found:
+            self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
+            if (labels % 1).any():
+                raise ValueError(f"it finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
+        return [one._replace(labels=one.labels.astype(np.int64)) for one in found]
 
     def _others(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
         """Maps (K, H', W') and numbers (K,) of each picture; [] if there are other outputs."""

@@ -1,8 +1,12 @@
-"""Reading the frames of video files, turned upright by their metadata, and writing frames."""
+"""Reading the frames of video files, turned upright by their metadata, and of cameras; and writing
+frames."""
 
 import errno
 import math
 import os
+import re
+import threading
+import time as clock
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +27,8 @@ _ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
 # at most by this part of its length.
 _TOLERANCE = 0.5
 _PART = 0.05
+_STREAM = re.compile(r"\d{1,3}|/dev/video\d+|[A-Za-z][\w+.-]*://.+")
+_PATIENCE = 2.0  # s, in which a stream may answer when it is left
 
 
 class Frame(NamedTuple):
@@ -66,6 +72,69 @@ def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator
         _check_end(path, capture, count, time)
     finally:
         capture.release()
+
+
+def is_stream(path: str | Path) -> bool:
+    """True for the number of a camera, its device /dev/video0, and an address such as rtsp://…"""
+    return _STREAM.fullmatch(str(path)) is not None and not (
+        os.path.isfile(path) or os.path.isdir(path)
+    )
+
+
+def stream_name(path: str) -> str:
+    """A stream in words: its address without user and password."""
+    return re.sub(r"//[^/@]*@", "//", path)
+
+
+def read_stream(path: str, channels: int = 3, every: int = 1) -> Iterator[Frame]:
+    """Reads a camera or a stream at its own pace: each frame is the newest one, at least `every`
+    after the last. Those that come meanwhile are dropped, but counted. C = 3 (RGB) or 1 (grey).
+
+    Raises:
+        BrokenImageError: it cannot be opened, or gives no frame.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    capture = cv2.VideoCapture(int(path) if path.isdecimal() else path)
+    if not capture.isOpened():
+        raise BrokenImageError(f"cannot read {stream_name(path)}: OpenCV opens no such stream")
+    colors = cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGR2GRAY
+    changed, start = threading.Condition(), clock.monotonic()
+    newest: tuple[int, float, np.ndarray | None] = -1, 0.0, None
+    left = ended = False
+
+    def watch() -> None:
+        nonlocal newest, ended
+        while not left:
+            there, image = capture.read()
+            with changed:
+                ended = not there
+                if there:
+                    newest = newest[0] + 1, clock.monotonic() - start, image
+                changed.notify()
+            if not there:
+                break
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    following = 0
+    try:
+        while True:
+            with changed:
+                while not ended and newest[0] < following:
+                    changed.wait()
+                number, time, image = newest
+            if image is None or number < following:
+                break
+            following = number + every
+            image = cv2.cvtColor(image, colors).reshape(*image.shape[:2], channels)
+            yield Frame(number, time, image, 1)
+    finally:
+        left = True
+        thread.join(_PATIENCE)
+        if not thread.is_alive():
+            capture.release()
+    if number < 0:
+        raise BrokenImageError(f"cannot read {stream_name(path)}: it gives no frame")
 
 
 def frame_rate(path: str | Path) -> float:

@@ -16,6 +16,8 @@ from darswin.ops.checks import check_pair, per_channel, tensor_there
 from darswin.utils.arrays import as_tensor
 from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, check_images, check_lens
+from darswin.views.floor import on_floor
+from darswin.views.orientation import Vector
 
 if TYPE_CHECKING:
     from darswin.frames.plans import Plan, Sampler
@@ -126,10 +128,10 @@ class Remap:
         return self._moved(points, lambda p: self.some_lens.unproject_points(p, self.size))
 
     def boxes_to_image(self, boxes: Any) -> MovedBoxes:
-        """Boxes (K, 4) of the view → boxes of the picture, by the ellipses inside them.
+        """Boxes (K, 4 or 5) of the view → boxes of the picture, by the ellipses inside them.
 
-        Boxes are cut at the edges of the view first, and those without an area are NaN. See
-        `darswin.boxes.carry`.
+        Boxes are cut at the edges of the view first, unless they are turned, and those without an
+        area are NaN. See `darswin.boxes.carry`.
         """
         return self._boxes(boxes, self.to_image, (self.view_size, self.size), self.rays)
 
@@ -138,6 +140,26 @@ class Remap:
         sizes = self.size, self.view_size
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
 
+    def floor(self, boxes: Any, height: float, up: Vector, radius: float = 0.0) -> Any:
+        """Where the things in boxes (K, 4) of a level view stand on the floor, (K, 2) in metres.
+
+        The origin is below the camera. y is ahead: along the level part of the optical axis, or of
+        the picture's top if the axis is within 10° of the vertical. x is to the right of it.
+
+        Args:
+            height: of the camera above the floor, m.
+            up: the direction away from gravity in the camera's frame. The view is level with it.
+            radius: of the things, which are upright cylinders, m. 0 finds their nearest points.
+
+        Returns:
+            NaN where the lower side of a box is not below the horizon, or at the lower edge of the
+            view, where a thing may be cut.
+
+        Raises:
+            ValueError: a number is out of its range, or the view is not level with `up`.
+        """
+        return on_floor(self, boxes, height, up, radius)
+
     def _boxes(
         self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair],
         to_rays: PointMap,
@@ -145,11 +167,13 @@ class Remap:
         table = (
             boxes.detach().to("cpu", torch.float64).numpy() if isinstance(boxes, Tensor) else boxes
         )
-        table = of_boxes.clip(np.asarray(table, np.float64), sizes[0])
-        table[(table[:, 2:] <= table[:, :2]).any(1)] = np.nan
+        table = np.array(table, np.float64)
+        if table.shape[-1] != 5:
+            table = of_boxes.clip(table, sizes[0])
+        table[~(of_boxes.turned(table)[:, 2:4] > 0).all(1)] = np.nan
         found = [*of_boxes.carry(table, points_map, sizes[1])]
         if self.lens is not None:
-            found.append(np.nan_to_num(to_rays((table[:, :2] + table[:, 2:] - 1) / 2)))
+            found.append(np.nan_to_num(to_rays(of_boxes.turned(table)[:, :2] - 0.5)))
         if isinstance(boxes, Tensor):
             dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
             found = [torch.from_numpy(values).to(boxes.device, dtype) for values in found]

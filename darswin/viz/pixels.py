@@ -171,6 +171,7 @@ def draw_boxes(
     boxes: np.ndarray,
     texts: Sequence[str],
     colors: Sequence[Sequence[int]],
+    outlines: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draws boxes and their texts on an image (H, W, 1 or 3) uint8: (H, W, 3) uint8.
 
@@ -178,15 +179,19 @@ def draw_boxes(
         boxes: (K, 4), x0, y0, x1 and y1 in px, where the image covers (0, 0) to (W, H); of any
             order, the first on top.
         texts: of each box; ASCII, as OpenCV draws them. colors: (r, g, b) of each box.
+        outlines: (K, 4, 2), the corners of turned boxes, which are drawn in place of the boxes.
     """
     drawn = with_channels(image, 3).copy()
     scale = max(image.shape[:2]) / 1500
     thick, letters = max(1, round(2 * scale)), max(0.4, 0.8 * scale)
-    every = list(zip(boxes, texts, colors, strict=True))
-    for box, text, color in reversed(every):
+    every = list(zip(range(len(boxes)), boxes, texts, colors, strict=True))
+    for k, box, text, color in reversed(every):
         # A box ends at the edge of its last pixel.
         left, top, right, bottom = np.rint(np.add(box, (0, 0, -1, -1))).astype(int).tolist()
-        cv2.rectangle(drawn, (left, top), (right, bottom), color, thick)
+        if outlines is None:
+            cv2.rectangle(drawn, (left, top), (right, bottom), color, thick)
+        else:
+            cv2.polylines(drawn, [np.rint(outlines[k]).astype(np.int32)], True, color, thick)
         (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, letters, thick)
         foot = max(top, height + below)  # inside of the picture
         cv2.rectangle(drawn, (left, foot - height - below), (left + width, foot), color, cv2.FILLED)

@@ -13,10 +13,14 @@ from PIL import Image
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from graphs import write_constants, write_graph
+from graphs import write_constants, write_detector, write_graph
 
+from darswin.boxes import decode_rle
 from darswin.cli.main import main
+from darswin.cli.network import NetworkAnswers
+from darswin.lens import Equidistant
 from darswin.utils.video import write_frames
+from darswin.views import make_view
 
 SIZE = (240, 320)
 CENTER = [163.0, 117.0]
@@ -286,6 +290,39 @@ def test_each_frame_of_a_video(tmp_path, capsys):
     assert "v.mp4: 3 frames at" in capsys.readouterr().err
 
 
+def test_a_stream_ends_by_ctrl_c_with_its_predictions(tmp_path, monkeypatch, capsys):
+    picture, box = picture_of("Equidistant", (36, -8), 1)
+
+    class Camera:
+        def __init__(self, source):
+            assert source == "rtsp://me:secret@host/door"
+
+        isOpened = release = lambda self: True  # noqa: N815
+        read = lambda self: (True, picture[..., ::-1])  # noqa: E731
+
+    seen, add = [], NetworkAnswers.add
+
+    def interrupted(self, entry, image, lens):
+        seen.append(entry["frame"])
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        add(self, entry, image, lens)
+
+    network = write_graph(tmp_path / "n.onnx", size=(256, 256))
+    monkeypatch.setattr("darswin.utils.video.cv2.VideoCapture", Camera)
+    monkeypatch.setattr(NetworkAnswers, "add", interrupted)
+    argv = ["rtsp://me:secret@host/door", "--network", network, "--view", "tiles:5", "--every", "2"]
+    *found, speed = predict(*argv, out=tmp_path / "out", lens=lens_of("Equidistant"))
+    assert [entry["frame"] for entry in found] == seen[:2] and seen[1] - seen[0] >= 2
+    for entry in found:
+        (one,) = entry["detections"]
+        np.testing.assert_allclose(one["box"], box, atol=1.8)
+        assert entry["overlay"] == f"overlays/rtsp_host_door/{entry['frame']:06}.jpg"
+        assert (tmp_path / "out" / entry["overlay"]).is_file()
+    assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
+    assert "secret" not in capsys.readouterr().err
+
+
 def test_bad_files_are_named_and_all_others_are_written(disc, tmp_path):
     folder, _, expected = disc
     for name in ("b.png", "d.png"):
@@ -381,7 +418,7 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --threshold nan", "--threshold must be finite, got nan"),
         ("--network gone.onnx", "there is no file gone.onnx"),
         ("--network p.png", r"onnxruntime cannot read p\.png"),
-        ("--network raw.onnx", r"raw.onnx has the outputs output0 \(1, 4, 7\); known are"),
+        ("--network raw.onnx", r"raw.onnx has the outputs output0 \(1, 4, 11\); known are"),
         ("--network nan.onnx", "nan.onnx computes NaN"),
         ("--network n.onnx --labels gone.txt", "gone.txt"),
         ("--network n.onnx --task distance", "--task is distance, but n.onnx is a model for detec"),
@@ -455,6 +492,172 @@ def test_what_was_found_before_an_error_is_kept(disc, tmp_path):
             run_tiles(tmp_path, network, *argv, picture="in")
         (found,) = json.loads((tmp_path / "out" / "predictions.json").read_text())
         assert found["image"] == str(tmp_path / "in/a.png") and found["detections"] == []
+
+
+# -- masks, keypoints, turned boxes, and other files ----------------------------------------------
+
+PLACES = np.array([(140.0, 100.0), (225.0, 128.0), (95.0, 95.0), (170.0, 150.0)])  # px
+ANGLES = np.array([0.2, -0.6, 1.2, 0.9])
+
+
+def seen_in(view, size):
+    """The lens, and the map of each tile of a view of it."""
+    lens = {"model": "Equidistant", "focal": 88.0, "center": CENTER, "theta_max": math.radians(95)}
+    bound = Equidistant(focal=88.0, theta_max=lens["theta_max"], center=CENTER, image_size=SIZE)
+    name, _, count = view.partition(":")
+    return lens, make_view(name, size, **({"count": int(count)} if count else {})).at(bound, SIZE)
+
+
+def stack(rows, width):
+    """The rows of each tile, with others whose score is 0."""
+    most = max(map(len, rows))
+    return np.stack(
+        [np.pad(row.reshape(-1, width), ((0, most - len(row)), (0, 0))) for row in rows]
+    )
+
+
+def things_of(remap, size):
+    """In each tile, the things whose middles it shows well inside: their numbers and places."""
+    found = []
+    for tile in remap.tiles:
+        places = tile.to_view(PLACES - 0.5) + 0.5
+        inner = ((places > 30) & (places < np.array(size[::-1]) - 30)).all(1)
+        found.append((np.flatnonzero(inner), places[inner]))
+    assert {k for numbers, _ in found for k in numbers} == {*range(len(PLACES))}
+    return found
+
+
+@pytest.mark.parametrize(("view", "size"), [("mercator", (256, 384)), ("tiles:5", (192, 192))])
+def test_masks_and_keypoints_come_back(tmp_path, view, size):
+    """Discs of the picture are the masks of the view, and their middles and tops its keypoints."""
+    lens, remap = seen_in(view, size)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    discs = [np.hypot(x - u, y - v) < 12 for u, v in PLACES]
+    tops, rows, masks, points = PLACES - (0, 10), [], [], []
+    seen = [np.reshape(remap((255 * disc).astype(np.uint8)), (-1, *size)) / 255 for disc in discs]
+    most = max(len(numbers) for numbers, _ in things_of(remap, size))
+    for number, (numbers, places) in enumerate(things_of(remap, size)):
+        above = remap.tiles[number].to_view(tops[numbers] - 0.5) + 0.5
+        far = np.full(places.shape, -500.0)  # beyond what the picture shows
+        ones = np.ones((len(places), 3, 1))
+        points.append(np.concatenate((np.stack((places, above, far), 1), 0.5 * ones), 2))
+        rows.append(np.column_stack((places - 14, places + 14, 0.9 - numbers / 10, numbers)))
+        masks.append(np.zeros((most, *size)))
+        for row, k in enumerate(numbers):
+            masks[-1][row] = seen[k][number]
+    table = stack(rows, 6)
+    outputs = dict(
+        boxes=table[..., :4],
+        scores=table[..., 4],
+        labels=table[..., 5],
+        masks=np.stack(masks),
+        keypoints=stack(points, 9).reshape(*table.shape[:2], 3, 3),
+    )
+    outputs = {name: value.astype(np.float32) for name, value in outputs.items()}
+    network = write_detector(tmp_path / "n.onnx", size, outputs, batch=len(table))
+    write_picture(tmp_path / "p.png", np.zeros((*SIZE, 3), np.uint8))
+    argv = [tmp_path / "p.png", "--network", network, "--view", view]
+    (entry,) = predict(*argv, out=tmp_path / "out", lens=lens)
+    assert [one["label"] for one in entry["detections"]] == [0, 1, 2, 3]
+    for one, disc, place, top in zip(entry["detections"], discs, PLACES, tops, strict=True):
+        mask = decode_rle(one["mask"])
+        assert (mask & disc).sum() > 0.9 * (mask | disc).sum()
+        middle, head, nothing = one["keypoints"]
+        np.testing.assert_allclose(middle, [*place, 0.5], atol=0.01)
+        np.testing.assert_allclose(head, [*top, 0.5], atol=0.01)
+        assert nothing == [None, None, 0.5]
+    drawn = cv2.imread(str(tmp_path / "out" / entry["overlay"]))
+    assert all(drawn[disc].mean() > 40 for disc in discs)
+
+
+@pytest.mark.parametrize(("view", "size"), [("mercator", (256, 384)), ("tiles:5", (192, 192))])
+@pytest.mark.parametrize("format", ["json", "coco", "yolo"])
+def test_turned_boxes_come_back(tmp_path, view, size, format):
+    """Their sides are those of the picture: small ones keep their angles to those of the map."""
+    lens, remap = seen_in(view, size)
+    half, rows = np.array([9.0, 5.0]), []
+    for tile, (numbers, places) in zip(remap.tiles, things_of(remap, size), strict=True):
+        ahead = PLACES + 0.1 * np.column_stack((np.cos(ANGLES), np.sin(ANGLES)))
+        step = tile.to_view(ahead[numbers] - 0.5) + 0.5 - places
+        scale = np.hypot(*step.T)[:, None] / 0.1
+        turns = np.arctan2(step[:, 1], step[:, 0])
+        scores = 0.9 - numbers / 10
+        rows.append(np.column_stack((places, 2 * half * scale, scores, numbers, turns)))
+    outputs = dict(output0=stack(rows, 7).astype(np.float32))
+    names = {0: "a", 1: "b", 2: "c", 3: "d"}
+    network = write_detector(
+        tmp_path / "n.onnx", size, outputs, batch=len(rows), metadata=dict(task="obb", names=names)
+    )
+    write_picture(tmp_path / "000042.png", np.zeros((*SIZE, 3), np.uint8))
+    argv = [tmp_path / "000042.png", "--network", network, "--view", view, "--format", format]
+    (entry,) = predict(*argv, out=tmp_path / "out", lens=lens)
+    assert [one["label"] for one in entry["detections"]] == list("abcd")  # of the file itself
+    turned = np.array([one["turned"] for one in entry["detections"]])
+    np.testing.assert_allclose(turned[:, :2], PLACES, atol=0.5)
+    np.testing.assert_allclose(turned[:, 2:4], np.tile(2 * half, (4, 1)), atol=2.0)
+    np.testing.assert_allclose(np.sin(turned[:, 4] - ANGLES), 0, atol=0.1)
+    for one, (u, _, w, h, angle) in zip(entry["detections"], turned, strict=True):
+        across = (w * abs(np.cos(angle)) + h * abs(np.sin(angle))) / 2
+        assert abs(one["box"][0] - (u - across)) < 0.6 and abs(one["box"][2] - (u + across)) < 0.6
+    if format == "coco":
+        results = json.loads((tmp_path / "out/coco.json").read_text())
+        assert [one["image_id"] for one in results] == [42] * 4
+        assert [one["category_id"] for one in results] == [0, 1, 2, 3]
+        for one, given in zip(results, entry["detections"], strict=True):
+            x0, y0, x1, y1 = given["box"]
+            np.testing.assert_allclose(one["bbox"], [x0, y0, x1 - x0, y1 - y0], atol=0.02)
+            assert one["score"] == given["score"] and len(one["segmentation"][0]) == 8
+    if format == "yolo":
+        lines = (tmp_path / "out/labels/000042.txt").read_text().splitlines()
+        for line, (u, v, w, _, angle), given in zip(
+            lines, turned, entry["detections"], strict=True
+        ):
+            label, *numbers, score = map(float, line.split())
+            points = np.reshape(numbers, (4, 2)) * [SIZE[1], SIZE[0]]
+            ahead = points[1] - points[0]
+            np.testing.assert_allclose(points.mean(0), (u, v), atol=0.01)
+            np.testing.assert_allclose(ahead, [w * np.cos(angle), w * np.sin(angle)], atol=0.01)
+            assert (names[label], round(score, 4)) == (given["label"], given["score"])
+
+
+def test_boxes_that_overlap_are_merged_and_words_answer_questions(tmp_path, capsys):
+    """Of YOLO without its metadata, in whose boxes each thing has several."""
+    y, x = np.mgrid[:16, :16] * 8 + 4.0
+    cells = np.array([x.ravel(), y.ravel(), 0 * x.ravel() + 60, 0 * x.ravel() + 60])
+    rows = np.concatenate((cells, np.zeros((2, 256))))
+    near = (np.abs(x - 56) < 5) & (np.abs(y - 56) < 5)
+    rows[5, np.flatnonzero(near.ravel())] = np.linspace(0.8, 0.9, near.sum())
+    rows = np.pad(rows, ((0, 0), (0, 80)))  # the cells of 16 and 32 px
+    size, place = (128, 128), (64, 80)
+    network = write_detector(tmp_path / "n.onnx", size, {"output0": rows[None].astype(np.float32)})
+    write_picture(tmp_path / "p.png", np.zeros((*place, 3), np.uint8))
+    lens = {"model": "Equidistant", "focal": 24.0, "image_size": [*place], "theta_max": 1.2}
+    argv = [tmp_path / "p.png", "--network", network]
+    with pytest.raises(SystemExit, match=r"2 classes \(detect\), .*: say which by --task, or"):
+        predict(*argv, out=tmp_path / "out", lens=lens)
+    (entry,) = predict(*argv, "--task", "detect", out=tmp_path / "out", lens=lens)
+    (one,) = entry["detections"]
+    assert (one["label"], one["score"]) == (1, 0.9)
+    assert "detections (Ultralytics detect); pixels are rgb" in capsys.readouterr().err
+
+
+def test_pixels_are_those_of_the_form_unless_they_are_given(tmp_path, capsys):
+    outputs = dict(dets=np.full((1, 5, 4), 0.5, np.float32), labels=np.zeros((1, 5, 9), np.float32))
+    network = write_detector(tmp_path / "n.onnx", (64, 64), outputs)
+    for argv, mean, std, step in (
+        ({}, (0.485, 0.456, 0.406), (0.229, 0.224, 0.225), 1),
+        ({"std": (0.5,)}, (0.0,) * 3, (0.5,) * 3, 1),
+        ({"mean": (0.2,), "channels": "bgr"}, (0.2,) * 3, (1.0,) * 3, -1),
+    ):
+        answers = NetworkAnswers(str(network), **argv)
+        assert (answers._mean, answers._std, answers._step) == (mean, std, step)
+        said = capsys.readouterr().err
+        assert "detections (RF-DETR); pixels are" in said and f"std {std[0]:g}" in said
+    network = write_constants(
+        tmp_path / "m.onnx", (64, 64), maps=np.zeros((1, 3, 64, 64), np.float32)
+    )
+    with pytest.raises(ValueError, match=r"`format` is for detections, but .* a network for maps"):
+        NetworkAnswers(str(network), format="coco")
 
 
 # -- maps and numbers -------------------------------------------------------------------------
@@ -547,7 +750,7 @@ HEADS = {f"p{k}": np.zeros((1, 255, 64 // k, 64 // k), F) for k in (8, 16, 32)}
 @pytest.mark.parametrize(
     ("outputs", "said"),
     [
-        (dict(detection_out=np.zeros((1, 1, 100, 7), F)), r"detection_out \(1, 1, 100, 7\); known"),
+        (dict(heads=np.zeros((1, 1, 100, 9), F)), r"heads \(1, 1, 100, 9\); known"),
         (dict(maps=np.zeros((1, 3, 32, 16), F)), r"maps \(1, 3, 32, 16\); known are .*fraction"),
         (dict(maps=np.zeros((1, 3, 48, 48), F)), r"maps \(1, 3, 48, 48\); known"),
         (dict(maps=np.zeros((1, 3, 128, 128), F)), r"maps \(1, 3, 128, 128\); known"),

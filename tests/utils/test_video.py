@@ -1,10 +1,13 @@
 """Frames of video files, against what was written into them and what OpenCV itself reads."""
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 from videos import turn_video, write_video
 
+from darswin.utils import video
 from darswin.utils.image import BrokenImageError
 from darswin.utils.video import is_video, read_frames
 
@@ -80,3 +83,66 @@ def test_what_is_no_video(tmp_path):
     found = {name: is_video(tmp_path / name) for name in ("recording", "picture", "text", "none")}
     assert found == {"recording": True, "picture": False, "text": False, "none": False}
     assert is_video("none.MP4")
+
+
+class Camera:
+    """A camera of 100 frames per second, whose frames are as bright as their number; it ends after
+    `last` frames."""
+
+    last, opened = 40, True
+
+    def __init__(self, source):
+        self.source, self.count, self.released = source, 0, False
+        Camera.latest = self
+
+    def isOpened(self):  # noqa: N802
+        return self.opened
+
+    def read(self):
+        time.sleep(0.01)
+        self.count += 1
+        return self.count <= self.last, np.full((6, 8, 3), (self.count - 1, 0, 0), np.uint8)
+
+    def release(self):
+        self.released = True
+
+
+@pytest.mark.parametrize(("every", "pause"), [(1, 0.0), (1, 0.05), (3, 0.0), (4, 0.06)])
+def test_a_camera_gives_its_newest_frames(monkeypatch, every, pause):
+    monkeypatch.setattr(video.cv2, "VideoCapture", Camera)
+    numbers, times = [], []
+    for frame in video.read_stream("0", every=every):
+        assert (frame.image == (0, 0, frame.number)).all() and frame.orientation == 1  # RGB
+        numbers.append(frame.number)
+        times.append(frame.time)
+        time.sleep(pause)
+    assert Camera.latest.source == 0 and Camera.latest.released
+    steps = np.diff(numbers)
+    assert (steps >= every).all() and numbers[-1] >= 20 and sorted(times) == times
+    if pause:
+        assert len(numbers) < 40 / every  # what came meanwhile is dropped
+    assert video.read_stream("rtsp://a", 1).__next__().image.shape == (6, 8, 1)
+
+
+def test_a_camera_that_is_left_is_released(monkeypatch):
+    monkeypatch.setattr(video.cv2, "VideoCapture", Camera)
+    frames = video.read_stream("/dev/video0")
+    next(frames)
+    frames.close()
+    assert Camera.latest.released and Camera.latest.source == "/dev/video0"
+
+
+def test_streams_and_what_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "1").mkdir()
+    (tmp_path / "2").write_text("")
+    streams = ["0", "/dev/video2", "rtsp://u:p@host:554/a", "http://host/a.mjpg"]
+    assert all(map(video.is_stream, streams))
+    assert not any(map(video.is_stream, ["1", "2", "a.mp4", "C:/a.mp4", "/dev/null", "1234", "-1"]))
+    assert video.stream_name(streams[2]) == "rtsp://host:554/a"
+    monkeypatch.setattr(video.cv2, "VideoCapture", type("Closed", (Camera,), {"opened": False}))
+    with pytest.raises(BrokenImageError, match="cannot read rtsp://host:554/a: OpenCV opens no"):
+        next(video.read_stream(streams[2]))
+    monkeypatch.setattr(video.cv2, "VideoCapture", type("Empty", (Camera,), {"last": 0}))
+    with pytest.raises(BrokenImageError, match="cannot read 0: it gives no frame"):
+        next(video.read_stream("0"))

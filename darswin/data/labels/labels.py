@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from darswin.boxes import carry, carry_points, decode_rle, encode_rle
+from darswin.boxes import carry, carry_points, decode_rle, encode_rle, turned
 from darswin.boxes.carried import cut_polygon, ellipses
 from darswin.boxes.regions import NO_AREA, Part, area_of, box_of, shown_parts
 from darswin.data.cameras import Calibrations
@@ -119,12 +119,9 @@ def _outlines(thing: Thing) -> list[np.ndarray]:
         return []
     if len(thing.polygons):
         return [cut_polygon(polygon) for polygon in thing.polygons]
-    (outline,) = ellipses(thing.box[None], 288)
-    if thing.turn:
-        sin, cos = np.sin(thing.turn), np.cos(thing.turn)
-        middle = (thing.box[:2] + thing.box[2:]) / 2
-        outline = middle + (outline - middle) @ [[cos, sin], [-sin, cos]]
-    return [outline]
+    box = turned(thing.box[None])
+    box[:, 4] = thing.turn
+    return [*ellipses(box, 288)]
 
 
 def _with_outlines(

@@ -1,0 +1,399 @@
+"""Every public form of a detector's outputs: twelve known boxes are found, or a question is asked.
+
+Each form is written here as its exporter writes it, without the code that reads it.
+"""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+from graphs import write_detector
+
+from darswin.frames.onnx import OnnxNetwork
+
+SIZE = HEIGHT, WIDTH = 160, 224
+K = 12
+RANDOM = np.random.default_rng(5)
+X, Y = np.array([(24 + 48 * (k % 4), 24 + 48 * (k // 4)) for k in range(K)]).T
+MIDDLE = np.stack((X, Y), 1) + RANDOM.uniform(-3, 3, (K, 2))
+SIDES = RANDOM.uniform(14, 40, (K, 2))
+BOXES = np.concatenate((MIDDLE - SIDES / 2, MIDDLE + SIDES / 2), 1)
+CENTRED = np.concatenate((MIDDLE, SIDES), 1)
+SCORES = np.linspace(0.95, 0.4, K)
+LABELS = 3 + RANDOM.permutation(K)
+NAMES = {k: f"class {k}" for k in range(80)}
+POINTS = np.concatenate((MIDDLE[:, None] + RANDOM.uniform(-20, 20, (K, 17, 2)),
+                         RANDOM.uniform(0, 1, (K, 17, 1))), 2)  # fmt: skip
+ANGLES = RANDOM.uniform(-math.pi / 4, 3 * math.pi / 4, (K, 1))
+ACROSS = np.array([WIDTH, HEIGHT] * 2)
+YX = [1, 0, 3, 2]
+
+
+def boxes_of_turned():
+    """The upright boxes around turned ones, by their corners."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2 * SIDES[:, None]
+    cos, sin = np.cos(ANGLES), np.sin(ANGLES)
+    x, y = np.moveaxis(corners, -1, 0)
+    there = np.stack((x * cos - y * sin, x * sin + y * cos), -1) + MIDDLE[:, None]
+    return np.concatenate((there.min(1), there.max(1)), 1)
+
+
+def one_hot(classes, high=SCORES, low=0.01, labels=LABELS):
+    found = np.full((K, classes), low)
+    found[np.arange(K), labels] = high
+    return found
+
+
+def logit(p):
+    return np.log(p / (1 - p))
+
+
+def priors(*strides):
+    return np.array([
+        (x, y, s) for s in strides
+        for y, x in itertools.product(range(-(-HEIGHT // s)), range(-(-WIDTH // s)))
+    ])  # fmt: skip
+
+
+def dense(rows, of_cell, strides=(8, 16, 32), each=1):
+    """The rows of things in the cells of grids, in which all others are `of_cell(x, y, s)`."""
+    cells = np.array([of_cell(*cell) for cell in priors(*strides)], float)
+    cells = np.concatenate([cells] * each)
+    cells[places(rows, strides, each)] = rows
+    return cells
+
+
+def places(rows, strides=(8, 16, 32), each=1):
+    return np.linspace(5, each * len(priors(*strides)) - 9, len(rows)).astype(int)
+
+
+def beside(*parts):
+    return np.concatenate([np.reshape(part, (K, -1)) for part in parts], 1)
+
+
+def cell_row(width, *, first=()):
+    return lambda x, y, s: [
+        (x + 0.5) * s,
+        (y + 0.5) * s,
+        s,
+        s,
+        *first,
+        *[0.01] * (width - len(first)),
+    ]
+
+
+def yolo(rows):
+    """Ultralytics' outputs: cells last."""
+    return dense(rows, cell_row(rows.shape[1] - 4)).T
+
+
+def yolox(decoded):
+    rows = beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98))
+    if decoded:
+        return dense(rows, cell_row(81, first=(0.01,)))
+    cells = dense(rows, lambda x, y, s: [0.5, 0.4, 0, 0, 0.01, *[0.01] * 80])
+    x, y, s = priors(8, 16, 32)[places(rows)].T[..., None]
+    cells[places(rows), :4] = np.hstack((MIDDLE / s - np.hstack((x, y)), np.log(SIDES / s)))
+    return cells + np.sin(np.arange(85) + np.arange(len(cells))[:, None]) * [1e-7]
+
+
+def nanodet():
+    """A distance is the mean of two bins: 8 bins, of which two have the weight."""
+    cells = dense(np.zeros((K, 112)), lambda x, y, s: [0.01] * 80 + [0.1] * 32, (8, 16, 32, 64))
+    strides = priors(8, 16, 32, 64)
+    near = [np.abs(strides[:, :2] * strides[:, 2:] - m).max(1) + 100 * (strides[:, 2] != 8)
+            for m in MIDDLE]  # fmt: skip
+    for k, distances in enumerate(near):
+        at = int(np.argmin(distances))
+        x, y, s = strides[at]
+        box = BOXES[k]
+        for side, length in enumerate(
+            (x * s - box[0], y * s - box[1], box[2] - x * s, box[3] - y * s)
+        ):
+            low, part = divmod(length / s, 1)
+            share = np.full(8, 1e-9)
+            share[int(low)], share[int(low) + 1] = 1 - part, max(part, 1e-9)
+            cells[at, 80 + 8 * side : 88 + 8 * side] = np.log(share)
+        cells[at, :80] = one_hot(80)[k]
+    return cells
+
+
+def protos():
+    """A mask for each thing, of its box and half a pixel more, and others."""
+    y, x = np.mgrid[: HEIGHT // 4, : WIDTH // 4] * 4 + 2
+    masks = np.full((32, HEIGHT // 4, WIDTH // 4), -8.0)
+    for k, (x0, y0, x1, y1) in enumerate(BOXES):
+        masks[k][(x > x0 - 9) & (x < x1 - 5) & (y > y0) & (y < y1 + 9)] = 8
+    return masks
+
+
+WEIGHTS = np.eye(K, 32)
+IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
+# A table of K things and as many that are nothing, as networks fill them up.
+FULL = lambda rows, to=300: np.concatenate((rows, np.zeros((to - K, *rows.shape[1:]))))  # noqa: E731
+ULTRA = dict(names=NAMES, author="Ultralytics", imgsz=[*SIZE])
+SOFTMAX_ = np.log(np.column_stack((one_hot(91, low=1e-9), 1 - SCORES - 90e-9)))
+POSE = ULTRA | dict(task="pose", kpt_shape=[17, 3], names={0: "person"})
+ROWS = beside(BOXES, SCORES, LABELS)
+
+
+def of(task):
+    return dict(metadata=ULTRA | dict(task=task))
+
+
+def row(values, *more):
+    return beside(np.arange(K) * 0, values, *more)
+
+
+# Each form: its outputs without their batch, and how the network is written and read.
+FORMS = {
+    "own": (dict(boxes=FULL(BOXES), scores=FULL(SCORES), labels=FULL(LABELS).astype(int)), {}),
+    "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
+    "table": (dict(out=FULL(ROWS)), {}),
+    "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
+    "detect without task": (
+        dict(output0=yolo(beside(CENTRED, one_hot(80)))),
+        dict(metadata={"names": [*NAMES.values()]}),
+    ),
+    "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(told="detect")),
+    "segment": (
+        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos()),
+        of("segment"),
+    ),
+    "pose": (dict(output0=yolo(beside(CENTRED, SCORES, POINTS))), dict(metadata=POSE)),
+    "pose of 2": (
+        dict(output0=yolo(beside(CENTRED, SCORES, POINTS[..., :2]))),
+        dict(metadata=POSE | {"kpt_shape": [17, 2]}),
+    ),
+    "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
+    "detect, end to end": (dict(output0=FULL(ROWS)), of("detect")),
+    "segment, end to end": (
+        dict(output0=FULL(beside(ROWS, WEIGHTS)), output1=protos()),
+        of("segment"),
+    ),
+    "pose, end to end": (
+        dict(output0=FULL(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
+    ),
+    "obb, end to end": (
+        dict(output0=FULL(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
+    ),
+    "RT-DETR of Ultralytics": (
+        dict(output0=FULL(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
+    ),
+    "RT-DETR of Ultralytics, the best": (
+        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))),
+        dict(metadata=ULTRA | {"task": "detect", "head": "RTDETRDecoder"}),
+    ),
+    "RT-DETR of Ultralytics, older": (
+        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
+    ),
+    "YOLOv5": (
+        dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
+                          cell_row(81, first=(0.01,)), each=3),
+             head=np.zeros((3, 20, 28, 85))), dict(metadata=dict(stride=32, names=NAMES)),
+    ),
+    "YOLOv5 P6": (
+        dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
+                          cell_row(81, first=(0.01,)), (8, 16, 32, 64), 3)), {},
+    ),
+    "YOLOv5 of one class": (
+        dict(output=dense(beside(CENTRED, np.full(K, 0.98), SCORES / 0.98),
+                          cell_row(2, first=(0.01,)), each=3)), {},
+    ),
+    "YOLOv5 segment": (
+        dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98), WEIGHTS),
+                           cell_row(113, first=(0.01,)), each=3), output1=protos()), {},
+    ),
+    "YOLOv6": (
+        dict(outputs=dense(beside(CENTRED, np.ones(K), one_hot(80)), cell_row(81, first=(1,)))), {},
+    ),
+    "YOLOX": (dict(output=yolox(False)), {}),
+    "YOLOX, decoded": (dict(output=yolox(True)), {}),
+    "NanoDet-Plus": (dict(output=nanodet()), {}),
+    "RF-DETR": (
+        dict(dets=FULL(CENTRED_PARTS),
+             labels=FULL(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
+    ),
+    "RF-DETR segment": (
+        dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
+    ),
+    "RT-DETR": (
+        dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes"),
+    ),
+    "DETR": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS), dict(model_type="detr", masked=True)),
+    "DETR, told": (
+        dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))),
+        dict(scores="softmax"),
+    ),
+    "D-FINE of transformers": (
+        dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine"),
+    ),
+    "TensorFlow": (
+        {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
+         "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0)}, {},
+    ),
+    "EfficientDet": (dict(detections=row(BOXES[:, YX], SCORES, LABELS)), {}),
+    "MMDeploy": (dict(dets=beside(BOXES, SCORES), labels=LABELS), {}),
+    "MMDeploy segment": (
+        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
+    ),
+    "EfficientNMS": (
+        dict(num_dets=np.array([K]), det_boxes=FULL(BOXES, 100),
+             det_scores=FULL(SCORES, 100) - (np.arange(100) >= K),
+             det_classes=FULL(LABELS, 100).astype(int)), {},
+    ),
+    "YOLO-NAS": (
+        dict(boxes=dense(BOXES, lambda x, y, s: (x * s, y * s, x * s + s, y * s + s)),
+             scores=dense(one_hot(80), lambda *_: [0.01] * 80)), {},
+    ),
+    "YOLO-NAS with NMS": (
+        dict(num_predictions=np.array([K]), pred_boxes=BOXES, pred_scores=SCORES,
+             pred_classes=LABELS), {},
+    ),
+}  # fmt: skip
+# Those of all pictures in one table, or of one picture without a batch.
+FLAT = {
+    "YOLOv7, end to end": (dict(output=row(BOXES, LABELS, SCORES)), {}),
+    "YOLO-NAS, flat": (dict(graph2_flat_predictions=row(BOXES, SCORES, LABELS)), {}),
+    "SSD": (dict(detection_out=row(LABELS, SCORES, IN_PARTS)[None, None]), {}),
+    "torchvision": ({"1": BOXES, "2": LABELS, "3": SCORES}, {}),
+    "torchvision masks": (
+        {"1": BOXES, "2": LABELS, "3": SCORES,
+         "4": (protos()[:K].repeat(4, 1).repeat(4, 2) > 0)[:, None] * 1.0}, {},
+    ),
+    "torchvision keypoints": (
+        {"1": BOXES, "2": LABELS, "3": SCORES, "4": POINTS, "5": np.zeros((K, 17))}, {},
+    ),
+}  # fmt: skip
+# What is only known by names, metadata or a word, so that it is asked for without them.
+ASKED = {
+    "own, one masked", "detect", "detect without task", "detect of 51", "pose", "pose of 2", "obb",
+    "pose, end to end", "obb, end to end", "RT-DETR of Ultralytics",
+    "RT-DETR of Ultralytics, the best", "RT-DETR of Ultralytics, older", "RF-DETR",
+    "RF-DETR segment", "DETR", "DETR, told", "D-FINE of transformers", "TensorFlow", "EfficientDet",
+}  # fmt: skip
+ALL = FORMS | FLAT
+
+
+def written(folder, form, dtype=np.float32, batch=1, renamed=False):
+    """The network of a form, and the words that it needs."""
+    outputs, how = ALL[form]
+    how = dict(how)
+    words = {"task": how.pop("told", None), "scores": how.pop("scores", None)}
+    if "model_type" in how:
+        config = dict(model_type=how.pop("model_type"), id2label=NAMES)
+        (folder / "config.json").write_text(json.dumps(config))
+    if renamed:
+        names = dict(zip(outputs, "abcdef", strict=False))
+        outputs = {names[name]: value for name, value in outputs.items()}
+        how["sized"] = names.get(how.get("sized"))
+        how.pop("metadata", None)
+        words = {}
+    given = {}
+    for name, value in outputs.items():
+        value = np.asarray(value)
+        value = value.astype(np.int64 if value.dtype.kind == "i" else dtype)
+        given[name] = value if form in FLAT else value[None]
+    path = write_detector(folder / "n.onnx", SIZE, given, batch=batch, **how)
+    return path, {key: word for key, word in words.items() if word}
+
+
+def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
+    order = np.argsort(-found.scores)
+    turned = "obb" in form
+    labels = 0 * LABELS if "pose" in form or "one class" in form else LABELS
+    np.testing.assert_allclose(found.boxes[order], boxes_of_turned() if turned else BOXES, atol=px)
+    np.testing.assert_allclose(found.scores[order], SCORES, atol=in_scores)
+    assert found.labels[order].tolist() == labels.tolist()
+    assert (found.turned is None) != turned
+    if turned:
+        expected = np.concatenate((CENTRED, ANGLES), 1)
+        np.testing.assert_allclose(found.turned[order], expected, atol=px)
+    assert (found.keypoints is None) != ("pose" in form or "keypoints" in form)
+    if found.keypoints is not None:
+        numbers = found.keypoints.shape[2]
+        assert numbers == (2 if form == "pose of 2" else 3)
+        np.testing.assert_allclose(found.keypoints[order], POINTS[..., :numbers], atol=px)
+    shows = ("segment" in form or "masks" in form) and "MMDeploy" not in form
+    assert (found.masks is None) != shows
+    if shows:
+        for mask, box, known in zip(found.masks[order], found.boxes[order], protos(), strict=False):
+            scale = HEIGHT // mask.shape[0]
+            y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] * scale + scale / 2
+            inside = (x >= box[0]) & (x < box[2]) & (y >= box[1]) & (y < box[3])
+            known = known.repeat(4 // scale, 0).repeat(4 // scale, 1) > 0
+            is_cut = "DETR" not in form and "torchvision" not in form  # to their boxes
+            assert ((mask > 0.5) == (known & inside if is_cut else known)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+@pytest.mark.parametrize("form", ALL)
+def test_every_form_is_found(tmp_path, form, dtype):
+    near = {} if dtype == np.float32 else dict(px=0.3, in_scores=2e-3)
+    for batch in (1,) if form in FLAT else (1, "B"):
+        path, words = written(tmp_path, form, dtype, batch)
+        network = OnnxNetwork(path, count=2, threshold=0.3, **words)
+        assert network.kind == "detections" and network.batch == (2 if batch == "B" else 1)
+        found = network(np.zeros((3, 3, *SIZE), np.float32))
+        assert len(found) == 3
+        for one in found:
+            check_known(form, one, **near)
+
+
+@pytest.mark.parametrize("form", ALL)
+def test_no_form_is_taken_for_another(tmp_path, form):
+    """With its outputs renamed a, b, c, and without its metadata and words, a form is still right,
+    or a sentence asks for what cannot be known."""
+    path, _ = written(tmp_path, form, renamed=True)
+    (tmp_path / "config.json").unlink(missing_ok=True)
+    try:
+        network = OnnxNetwork(path)
+    except ValueError as error:
+        assert form in ASKED, error
+        said = ("say which by `", "known are")
+        assert "has the outputs" in str(error) and any(words in str(error) for words in said)
+    else:
+        assert form not in ASKED
+        (found,) = network(np.zeros((1, 3, *SIZE), np.float32))
+        check_known(form, found)
+
+
+def test_words_that_do_not_fit_are_told(tmp_path):
+    for form, words, said in (
+        ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
+        (
+            "detect",
+            {"task": "boxes"},
+            "`task` must be one of detect, pose, obb, segment, got boxes",
+        ),
+        ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
+        ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
+    ):
+        path, _ = written(tmp_path, form)
+        with pytest.raises(ValueError, match=said):
+            OnnxNetwork(path, **words)
+
+
+def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):
+    for form, count in (("detect", 80), ("detect without task", 80), ("own", 0), ("DETR", 80)):
+        (tmp_path / form / "onnx").mkdir(parents=True)
+        path, words = written(tmp_path / form / "onnx", form)
+        config = tmp_path / form / "onnx/config.json"
+        if config.is_file():
+            config.rename(tmp_path / form / "config.json")
+        network = OnnxNetwork(path, **words)
+        assert network.names == dict(list(NAMES.items())[:count])
+
+
+def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
+    seven = np.array([[0.0, 0.5, 0.1, 0.1, 0.1, 0.15, 0.05]], np.float32)  # as of emotions
+    pooled = np.zeros((1, 1, 5, 7), np.float32)  # a map of a 32nd
+    for value, kind in ((seven, "numbers"), (pooled, "maps")):
+        path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
+        assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
