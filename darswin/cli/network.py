@@ -26,6 +26,7 @@ from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
 from darswin.views import PlainView, Remap
+from darswin.views.floor import check_floor
 from darswin.viz.pixels import MOST_CLASSES, draw_boxes, label_image, overlay, palette
 
 VIEW, THRESHOLD = "mercator", 0.3
@@ -102,7 +103,7 @@ class NetworkAnswers(Answers):
         fov_deg: float | None = None, up: Sequence[float] | None = None,
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
-        top: int | None = None,
+        top: int | None = None, height: float | None = None, radius: float | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
         check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")
@@ -130,6 +131,24 @@ class NetworkAnswers(Answers):
         self._top, asked = top or TOP, top is not None or labels is not None
         self._classes = self._class_outputs() if asked else []
         self._boxes = Boxes()
+        self._floor = self._floor_of(height, up, radius)
+
+    def _floor_of(
+        self, height: float | None, up: Sequence[float] | None, radius: float | None
+    ) -> dict[str, Any] | None:
+        """The arguments of `Remap.floor`, if the `height` of the camera is given."""
+        if height is None:
+            check("radius", radius, radius is None, "given with --height")
+            return None
+        if up is None:
+            text = "`height` needs `up`, the direction away from gravity, to find the floor"
+            raise naming(ValueError(text), "height", "up")
+        if self.network.kind != "detections":
+            text = f"`height` is for boxes, but {self.network.path} gives {self.network.kind}"
+            raise naming(ValueError(text), "height")
+        floor: dict[str, Any] = dict(height=height, up=up, radius=radius or 0.0)
+        check_floor((self.view.tiles or [self.view])[0], **floor)
+        return floor
 
     def _class_outputs(self) -> list[str]:
         """The outputs that are numbers of classes, if these were asked for."""
@@ -194,13 +213,16 @@ class NetworkAnswers(Answers):
         for tile, (inner, *others) in zip(seen.remap.tiles, found, strict=True):
             carried, visible, _ = tile.boxes_to_image(inner)
             kept = visible > 0
-            parts.append([values[kept] for values in (carried, visible, *others)])
-        carried, visible, scores, labels = map(np.concatenate, zip(*parts, strict=True))
+            floor = np.full((len(inner), 2), np.nan)
+            floor = tile.floor(inner, **self._floor) if self._floor else floor
+            parts.append([values[kept] for values in (carried, visible, *others, floor)])
+        carried, visible, scores, labels, floor = map(np.concatenate, zip(*parts, strict=True))
         if len(found) == 1:  # a network knows best which of its own boxes are one thing
             order = np.argsort(-scores, kind="stable")
         else:
             order = boxes.merge(carried, scores, labels)
         carried, visible, scores, labels = (v[order] for v in (carried, visible, scores, labels))
+        places = [None if None in place else place for place in _rounded(floor[order], 3)]
 
         there = boxes.spherical(carried, seen.remap.rays_of_image)
         names = [self._name(label) for label in labels.tolist()]
@@ -217,6 +239,7 @@ class NetworkAnswers(Answers):
                 for angle in ("azimuth", "elevation", "width", "height")
             },
             "ray": _rounded(there.ray, 6),
+            **({"floor": places} if self._floor else {}),
         }
         entries = [
             dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)

@@ -49,7 +49,8 @@ def predict(
     size: tuple[int, int] | None = None, fov_deg: float | None = None,
     up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
     std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
-    threshold: float | None = None, labels: str | None = None,
+    threshold: float | None = None, labels: str | None = None, height: float | None = None,
+    radius: float | None = None,
 ) -> list[dict]:  # fmt: skip
     """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
     or runs any network in an ONNX file, such as a detector, on a view of them.
@@ -106,10 +107,15 @@ def predict(
         labels: a file with the names of the network's classes: a text file, whose line k names
             class k, from 0, and whose empty lines are no classes; JSON or YAML with a list or with
             {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt).
+        height: of the camera above a flat floor, in metres. Each detection then tells where it
+            stands: "floor" is metres to the right and ahead of the camera. It needs `up`.
+        radius: of things on the floor, in metres: 0.25 suits people. The default is 0, for their
+            nearest points.
     """
     options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
-        "channels": channels, "threshold": threshold, "labels": labels,
+        "channels": channels, "threshold": threshold, "labels": labels, "height": height,
+        "radius": radius,
     }  # fmt: skip
     if network is None and (given := [k for k, value in options.items() if value is not None]):
         raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")
