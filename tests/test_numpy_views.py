@@ -31,6 +31,7 @@ BOXES = np.concatenate((PLACES, PLACES + 8), 1)
 FULL = FullSize(fitted(SIZE, 48, "crop").at(CAMERA, SIZE))
 MOVED = views.CropView((4, 4, 40, 40), (30, 30), views.Turn(0.3)).at(CAMERA, SIZE)
 REMAP = ROOM.at(CAMERA, SIZE)
+MERCATOR = views.MercatorView((48, 64)).at(CAMERA, SIZE)
 PLAN = camera.plan(ROOM, CAMERA, SIZE)
 FOUND = calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
 
@@ -77,6 +78,9 @@ CASES = {
     "carry_mask": (lambda a: boxes.carry_mask(a, lambda p: p + 1.0, SIZE), VALUES > 5),
     "iou": (lambda a: boxes.iou(a, BOXES), BOXES + 1),
     "merge": (lambda a: boxes.merge(a, np.linspace(1, 0, 6), np.zeros(6, int)), BOXES),
+    "turned boxes": (boxes.turned, BOXES),
+    "corners of boxes": (boxes.corners, BOXES),
+    "floor": (lambda a: MERCATOR.floor(a, 2.0, (0, -1, 0)), BOXES),
     "encode_rle": (lambda a: boxes.decode_rle(boxes.encode_rle(a)), VALUES > 5),
     "spherical": (lambda a: boxes.spherical(a, _rays).ray, BOXES),
     "plan": (PLAN.points, PLACES / 2),

@@ -29,9 +29,12 @@ def _boxes_of(one: Detections) -> np.ndarray:
     return one.boxes if one.turned is None else one.turned
 
 
-def in_picture(remap: Remap, found: Sequence[Detections]) -> Found:
+def in_picture(
+    remap: Remap, found: Sequence[Detections], floor: Mapping[str, Any] | None = None
+) -> Found:
     """The detections in a view, or in all tiles, as columns of things in the picture, the best
-    first: boxes, visible, scores and labels; and keypoints, turned and masks if there are any.
+    first: boxes, visible, scores and labels; and keypoints, turned and masks if there are any, and
+    places on the floor by the arguments of `Remap.floor`.
 
     Things come by the ellipses in their boxes, turned or not; keypoints as points; and masks by
     their pixels. What the picture does not show is left out, and keypoints of it are NaN.
@@ -40,6 +43,8 @@ def in_picture(remap: Remap, found: Sequence[Detections]) -> Found:
     for number, (tile, one) in enumerate(zip(remap.tiles, found, strict=True)):
         part = {"scores": one.scores, "labels": one.labels}
         part["boxes"], part["visible"], _ = tile.boxes_to_image(_boxes_of(one))
+        if floor is not None:
+            part["floor"] = tile.floor(one.boxes, **floor)
         if one.keypoints is not None:
             places = boxes.carry_points(one.keypoints[..., :2], tile.to_image)
             part["keypoints"] = np.concatenate((places, one.keypoints[..., 2:]), -1)
@@ -145,5 +150,7 @@ def entries(found: Found, columns: Mapping[str, Sequence[Any]]) -> list[dict[str
         for key, digits in (("keypoints", 3), ("turned", 4)) if key in found
     }  # fmt: skip
     more |= {"mask": found["masks"]} if "masks" in found else {}
+    if "floor" in found:
+        more["floor"] = [None if None in place else place for place in rounded(found["floor"], 3)]
     columns = {**columns, **more}
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

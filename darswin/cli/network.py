@@ -38,6 +38,7 @@ from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
 from darswin.views import PlainView, Remap
+from darswin.views.floor import check_floor
 from darswin.viz.pixels import label_image, overlay, palette
 
 VIEW, THRESHOLD, RESULTS = "mercator", 0.3, "coco.json"
@@ -115,7 +116,8 @@ class NetworkAnswers(Answers):
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
         top: int | None = None, task: Any = None, scores: Any = None,
-        format: Literal["json", "coco", "yolo"] | None = None,
+        format: Literal["json", "coco", "yolo"] | None = None, height: float | None = None,
+        radius: float | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
         check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")
@@ -150,6 +152,24 @@ class NetworkAnswers(Answers):
         self._top, asked = top or TOP, top is not None or labels is not None
         self._classes = self._class_outputs() if asked else []
         self._boxes = Boxes()
+        self._floor = self._floor_of(height, up, radius)
+
+    def _floor_of(
+        self, height: float | None, up: Sequence[float] | None, radius: float | None
+    ) -> dict[str, Any] | None:
+        """The arguments of `Remap.floor`, if the `height` of the camera is given."""
+        if height is None:
+            check("radius", radius, radius is None, "given with --height")
+            return None
+        if up is None:
+            text = "`height` needs `up`, the direction away from gravity, to find the floor"
+            raise naming(ValueError(text), "height", "up")
+        if self.network.kind != "detections":
+            text = f"`height` is for boxes, but {self.network.path} gives {self.network.kind}"
+            raise naming(ValueError(text), "height")
+        floor: dict[str, Any] = dict(height=height, up=up, radius=radius or 0.0)
+        check_floor((self.view.tiles or [self.view])[0], **floor)
+        return floor
 
     def _said(self, pixels: Pixels) -> str:
         """What is read of the file, and what it is given."""
@@ -221,7 +241,7 @@ class NetworkAnswers(Answers):
         if self.network.overlaps:
             found = [without_overlaps(one) for one in found]
         self._boxes.add(found)
-        things = in_picture(seen.remap, found)
+        things = in_picture(seen.remap, found, self._floor)
         there = boxes.spherical(things.get("turned", things["boxes"]), seen.remap.rays_of_image)
         names = [self._name(label) for label in things["labels"].tolist()]
         texts = [f"{name} {score:.2f}" for name, score in zip(names, things["scores"], strict=True)]

@@ -48,9 +48,10 @@ def detections_to_images(
     """Carries the detections of the pictures that a view shows to the pixels of the images.
 
     Args:
-        found: for each picture, boxes (K, 4), scores (K,) and labels (K,); and optionally masks
-            (K, 1, H', W') and keypoints (K, P, 3), and other tensors (K, ...), which stay as they
-            are. Values of another length are left out. The coordinates are torchvision's.
+        found: for each picture, boxes (K, 4 or 5), scores (K,) and labels (K,); and optionally
+            masks (K, 1, H', W') and keypoints (K, P, 3), and other tensors (K, ...), which stay as
+            they are. Values of another length are left out. The coordinates are those of
+            `darswin.boxes`.
 
     Returns:
         For each image, the same dicts. The boxes are those of what the image shows of the ellipses
@@ -103,9 +104,12 @@ def _carried(found: Mapping[str, Tensor], remap: Remap) -> dict[str, Tensor]:
     """The detections of one picture in the pixels of the image."""
     boxes, scores = found["boxes"], found["scores"]
     count = len(boxes)
-    if boxes.shape != (count, 4) or scores.shape != (count,) or found["labels"].shape != (count,):
+    are_boxes = boxes.shape in ((count, 4), (count, 5))
+    if not are_boxes or scores.shape != (count,) or found["labels"].shape != (count,):
         shapes = ", ".join(f"{name} {tuple(found[name].shape)}" for name in NAMES)
-        raise ValueError(f"detections must be boxes (K, 4), scores (K,), labels (K,), got {shapes}")
+        raise ValueError(
+            f"detections must be boxes (K, 4 or 5), scores (K,), labels (K,), got {shapes}"
+        )
     kept = {
         name: value for name, value in found.items()
         if isinstance(value, Tensor) and value.dim() and len(value) == count

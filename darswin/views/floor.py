@@ -14,17 +14,14 @@ _LEVEL = math.radians(5)  # by which a view may lean
 _STEEP = math.cos(math.radians(10))
 _CUT = 1.0  # px: a box that ends so near to the lower edge of a view may be cut there
 _STEPS, _STEP, _NEAR = 12, 1e-4, 0.1  # of the search: at most, m, and px that may remain
-_LEVELS = np.linspace(0, 1, 5)[:, None]  # of a cylinder, and the points of its circles
-_TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+_LEVELS = np.linspace(0, 1, 3)[:, None]  # of a cylinder, and the points of its circles
+_TURN = np.linspace(0, 2 * np.pi, 36, endpoint=False)
 _CIRCLE = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
 
 
 def on_floor(remap: Any, boxes: Any, height: float, up: Vector, radius: float) -> Any:
     """`Remap.floor`."""
-    check("height", height, height is not None and 0 < height < math.inf, "above 0 m")
-    check("radius", radius, 0 <= radius < math.inf, "at least 0 m")
-    above = unit_vector("up", up)
-    _check_level(remap.view, above)
+    above = check_floor(remap.view, height, up, radius)
     table = table_of(boxes, (4,))
     frame = np.array(frame_of(above, AXIS if abs(above[2]) < _STEEP else PICTURE_TOP, True))
     foot = np.stack(((table[:, 0] + table[:, 2]) / 2, table[:, 3]), -1)
@@ -39,17 +36,22 @@ def on_floor(remap: Any, boxes: Any, height: float, up: Vector, radius: float) -
     return like(boxes, place)
 
 
-def _check_level(view: Any, up: tuple[float, float, float]) -> None:
-    """ValueError for a view that is not level with `up`."""
-    own = getattr(view, "up", None)
+def check_floor(view: Any, height: float, up: Any, radius: float) -> tuple[float, float, float]:
+    """The unit vector of `up`; ValueError for a number that is out of its range, and for a view
+    that is not level with it."""
+    check("height", height, height is not None and 0 < height < math.inf, "above 0 m")
+    check("radius", radius, 0 <= radius < math.inf, "at least 0 m")
+    above, own = unit_vector("up", up), getattr(view, "up", None)
     if own is None:
         raise ValueError(
             "boxes tell where things stand only in a level view, such as mercator, panorama or a "
             f"tile of tiles, got {view}"
         )
-    if math.dist(own, up) > 2 * math.sin(_LEVEL / 2):
+    if math.dist(own, above) > 2 * math.sin(_LEVEL / 2):
         shown = "({:.3g}, {:.3g}, {:.3g})".format
-        raise ValueError(f"the view is level with up={shown(*own)}, not {shown(*up)}: make it so")
+        text = f"the view is level with up={shown(*own)}, not {shown(*above)}: make it so"
+        raise ValueError(text)
+    return above
 
 
 def _search(
@@ -73,7 +75,7 @@ def _search(
         slopes = np.moveaxis(found[1:] - found[0], 0, -1) / _STEP
         known = np.isfinite(slopes).all((1, 2)) & (np.abs(np.linalg.det(slopes)) > 0)
         state[~known] = np.nan
-        if not known.any() or np.abs(gap[known]).max() < 1e-3 * _NEAR:
+        if not known.any() or np.abs(gap[known]).max() < 0.01 * _NEAR:
             break
         step = np.linalg.solve(slopes[known], gap[known, :, None])[..., 0]
         most = np.hypot(*state[known, :2].T) / 2 + radius
@@ -100,6 +102,7 @@ def _boxes_of(
     depth = np.broadcast_to(height - state[..., 2, None, None] * _LEVELS, level.shape[:-1])
     rays = torch.from_numpy(np.insert(level, 1, depth, -1) @ frame.T)
     points = remap.view.to_points(rays[None], remap.lens, remap.size)[0].numpy() + 0.5
-    lean = np.abs(points[..., -1, :, :].mean(-2) - points[..., 0, :, :].mean(-2))
-    box = np.concatenate((points.min((-3, -2)), points.max((-3, -2))), -1)
-    return box, lean[..., 0] > lean[..., 1]
+    x, y = np.ascontiguousarray(np.moveaxis(points, -1, 0))
+    across, along = (np.abs(of[..., -1, :].mean(-1) - of[..., 0, :].mean(-1)) for of in (x, y))
+    x, y = x.reshape(*state.shape[:-1], -1), y.reshape(*state.shape[:-1], -1)
+    return np.stack((x.min(-1), y.min(-1), x.max(-1), y.max(-1)), -1), across > along

@@ -247,6 +247,38 @@ def test_gravity_and_a_field_of_view_change_what_is_seen(disc, tmp_path):
     assert mercator == default
 
 
+@pytest.mark.parametrize("view", ["mercator", "tiles:4"])
+def test_where_things_stand_on_the_floor(tmp_path, view):
+    """A camera that looks down by 30°; each box is that of its own tile."""
+    up = (0, -math.cos(math.radians(30)), -math.sin(math.radians(30)))
+    found = np.array([[[20, 20, 30, 50], [30, 10, 40, 20]]], np.float32)
+    scores, labels = np.array([[0.9, 0.8]], np.float32), np.array([[1, 2]])
+    outputs = dict(boxes=found, scores=scores, labels=labels)
+    argv = ["--up=" + ",".join(map(str, up)), "--fov_deg", "120"]
+    plain = run_constants(tmp_path, *argv, view=view, **outputs)["detections"]
+    argv += ["--height", "3", "--radius", "0.25"]
+    entries = run_constants(tmp_path, *argv, view=view, **outputs)["detections"]
+    lens = Equidistant(24.0, 1.2, image_size=(64, 80))
+    name, _, count = view.partition(":")
+    options = {"count": int(count)} if count else {}
+    made = make_view(name, (64, 64), fov=math.radians(120), up=up, **options)
+    known = []
+    for tile in made.at(lens, (64, 80)).tiles:
+        there, visible, _ = tile.boxes_to_image(found[0].astype(float))
+        places = tile.floor(found[0].astype(float), 3.0, up, 0.25)
+        known += [(box, place) for box, place, v in zip(there, places, visible, strict=True) if v]
+    assert len(entries) == len(plain) > 1
+    for entry, before in zip(entries, plain, strict=True):
+        place = entry.pop("floor")
+        assert entry == before
+        (want,) = [p for box, p in known if np.abs(box - entry["box"]).max() < 0.01]
+        if place is None:
+            assert np.isnan(want).any()
+        else:
+            np.testing.assert_allclose(place, want, atol=1e-3)
+    assert any(place is not None for _, place in known)
+
+
 def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(tmp_path, capsys):
     """A box that a network draws around what it guesses beyond θ_max, and one that is all there."""
     lens = lens_of("Equidistant") | {"theta_max": 1.0}  # 88 px around (163, 117)
@@ -424,6 +456,15 @@ def test_a_network_that_takes_other_pictures(disc, tmp_path):
         ("--network n.onnx --task distance", "--task is distance, but n.onnx is a model for detec"),
         ("--network n.onnx --model digits", "give either --run, .* or --network, an ONNX file"),
         ("--network n.onnx --run r", "give either --run, .* or --network, an ONNX file"),
+        ("--network n.onnx --height 2", "--height needs --up, the direction away from gravity"),
+        ("--network n.onnx --radius 1", "--radius must be given with --height, got 1.0"),
+        ("--network n.onnx --height -1 --up=0,-1,0", "--height must be above 0 m, got -1"),
+        ("--network n.onnx --height 2 --radius -1 --up=0,-1,0", "--radius must be at least 0 m"),
+        ("--network n.onnx --height 2 --up=0,-1,0 --view square", "no .*up"),
+        (
+            "--network maps.onnx --height 2 --up=0,-1,0",
+            "--height is for boxes, but maps.onnx gives",
+        ),
         ("--model digits --view mercator", "--view is an option of --network, an ONNX file"),
         ("--model digits --labels l.txt", "--labels is an option of --network"),
     ],
@@ -436,6 +477,7 @@ def test_what_is_wrong_is_named(disc, tmp_path, monkeypatch, argv, said):
         ("raw", {"outputs": "undecoded"}), ("nan", {"outputs": "nan"}),
     ):  # fmt: skip
         write_graph(tmp_path / f"{name}.onnx", **({"size": (256, 256)} | options))
+    write_constants(tmp_path / "maps.onnx", (64, 64), maps=np.zeros((1, 2, 64, 64), np.float32))
     words = ["p.png", *argv.split(), "--lens", json.dumps(lens_of("Equidistant")), "--out", "out"]
     with pytest.raises(SystemExit, match=said):
         main(["predict", *words])

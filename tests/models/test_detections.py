@@ -174,6 +174,18 @@ def test_masks_and_keypoints_come_back_with_the_boxes(name, kind):
 
 
 @torch.no_grad()
+def test_turned_boxes_come_back_as_turned_ones():
+    lens, images = LENSES["radial"], torch.zeros(1, 3, *SIZE)
+    boxes = torch.tensor([[30.0, 34, 12, 20, 0.4]])
+    detector = LensAdapter(_Constant(boxes), 64, view="tiles", boxes=lambda out: [out] * 5)
+    (found,) = detector(images, lens)
+    assert found["boxes"].shape == (5, 5)
+    remap = make_view("tiles", (64, 64)).at(lens, SIZE)
+    known = torch.cat([tile.boxes_to_image(boxes).boxes for tile in remap.tiles])
+    assert (found["boxes"][:, None] - known).abs().amax(-1).amin(1).max() < 1e-3
+
+
+@torch.no_grad()
 @pytest.mark.parametrize("name", VIEWS)
 def test_no_boxes_and_boxes_that_the_lens_does_not_see(name):
     lens, images = LENSES["beyond 90°"], torch.zeros(1, 3, *SIZE)
@@ -229,7 +241,7 @@ def test_odd_boxes_of_networks(name):
     assert empty["boxes"].shape == (0, 4)
     for wrong, kind, message in (
         (dict(scores=torch.ones(2)), ValueError, r"got boxes \(1, 4\), scores \(2,\)"),
-        (dict(boxes=torch.zeros(1, 5)), ValueError, r"got boxes \(1, 5\)"),
+        (dict(boxes=torch.zeros(1, 6)), ValueError, r"got boxes \(1, 6\)"),
         (dict(boxes=large.numpy()), TypeError, "boxes of detections must be a tensor"),
     ):
         bad = [out | wrong] * tiles
