@@ -21,9 +21,10 @@ class CalibratedLens:
     Attributes:
         lens: the lens, a batch of one in float64. Its theta_max is the largest of its
             `side_angles`, at most the angle up to which r rises.
-        rotations, translations: (P, 3, 3) and (P, 3): a point (x, y) of the board is at
-            rotation @ (x, y, 0) + translation in the camera's frame, in the board's unit. NaN for
+        rotations, translations: (P, 3, 3) and (P, 3): the points of the board are at
+            rotation @ board[k] + translation in the camera's frame, in the board's unit. NaN for
             pictures that show too few corners.
+        board: (K, 3): its points as they were found: bent, and stretched along y, if that is sure.
         residuals: (P, K, 2) px: the pixels of the lens minus the corners; NaN where not seen.
         weights: (P, K) in [0, 1]: how much each corner counts.
         theta: (P, K) rad: the angle of each corner; NaN where not seen.
@@ -31,19 +32,21 @@ class CalibratedLens:
         names: those of the pictures.
         sigma: px: the standard deviation of a corner along one axis, from the median.
         error: px: the root mean square distance of corners from the lens, without those off it.
-        left_out: px: the same from a lens that is found without their picture, to first order; NaN
-            for fewer than 4 pictures.
+        left_out: px: the same in pictures that were left out, each fifth of them once; NaN for
+            fewer than 4 pictures.
         supported: rad: the largest angle with corners around it.
-        parameters: the names of the n numbers that were found for the lens.
+        parameters: the names of the n numbers that were found for the lens and for the board: its
+            bend in x and in y, and its stretch.
         covariance: (n, n), theirs.
         models: for "auto", the best first: (model, left_out, error, ""), or (model, NaN, NaN, the
-            reason why there is none).
+            reason why there is none). For all but the best few, left_out is of first order.
         doubts: what looks wrong, in sentences. Corners are counted from 1.
     """
 
     lens: Lens
     rotations: Tensor
     translations: Tensor
+    board: Tensor
     residuals: Tensor
     weights: Tensor
     theta: Tensor

@@ -13,18 +13,13 @@ UNSURE, UNKNOWN = 0.01, 0.2  # the radius's standard deviation, as a part of it
 FEW, BLURRED, PARALLEL = 8, 1.0, 12.0  # pictures; px; degrees
 WRONG = 0.02  # of the picture's side: a corner's standard deviation
 GUESSED = 4.0  # left_out, by the standard deviation; 1.5 is usual
-STRETCHED = 0.003  # of a pixel's side
 ONE_DISTANCE = 1.05  # the distance of the farthest board, by that of the nearest
 COVERED = 0.8  # of theta_max
 SHOWN = 10  # corners
 
 
-def doubts(
-    found: CalibratedLens, seen: Tensor, middle: Tensor, stretch: tuple[float, float]
-) -> list[str]:
-    """What looks wrong, in sentences; seen: (P, K); middle: (3,), of the board's points; stretch:
-    how much longer than in x things seem in y, as a part of their length: in the picture, and on
-    the board.
+def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor) -> list[str]:
+    """What looks wrong, in sentences; seen: (P, K); middle: (3,), of the board's points.
 
     Raises:
         CalibrationError: the pictures do not determine the lens.
@@ -75,7 +70,6 @@ def doubts(
             f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
             "or another model fits better"
         )
-    said += _stretched(*stretch)
     far = middles.norm(dim=1)
     if far.max() < ONE_DISTANCE * far.min():
         said.append("all boards are at one distance: take some nearer and some farther")
@@ -92,22 +86,31 @@ def doubts(
     return said
 
 
-def _stretched(picture: float, board: float) -> list[str]:
-    """What looks wrong with the ratio of sides of the pixels and of the board."""
-    longer = f"{100 * abs(picture):.2g} % {'longer' if picture > 0 else 'shorter'} than along x"
-    pixels = "take pictures that were not resized, or find the ratio with square_pixels=False"
-    if picture == board and abs(board) > STRETCHED:
-        return [
-            f"lengths along y seem {longer}, of the pixels or of the board: measure the board's "
-            f"sides, and turn it by a quarter in some pictures; {pixels}"
-        ]
-    said = []
-    if abs(picture) > STRETCHED:
-        said.append(f"lengths along y seem {longer}: {pixels}")
-    if abs(board) > STRETCHED:
-        longer = f"{100 * abs(board):.2g} % {'longer' if board > 0 else 'shorter'}"
+def misshapen(found: CalibratedLens, shape: Tensor, confounded: bool) -> list[str]:
+    """What was found of the pixels and of the board, in sentences; shape: (3,), of the board;
+    confounded: its stretch may be that of the pixels."""
+    said, stretch = [], shape[2].item()
+    ratio = found.lens._affine()[0, 1, 1].item() - 1
+    if ratio:
+        said.append(f"lengths along y are {_longer(ratio)} than along x: this is in the lens")
+    if confounded:
         said.append(
-            f"the board seems {longer} along its columns than along its rows: measure it, since "
-            "printers stretch"
+            f"lengths along y seem {_longer(stretch)}, of the pixels or of the board: measure the "
+            "board's sides, and turn it by a quarter in some pictures; the pixels are taken as "
+            "square"
         )
+    elif stretch:
+        said.append(
+            f"the board is {_longer(stretch)} along its columns than along its rows, as printers "
+            "stretch: this is taken into account"
+        )
+    if shape[:2].any():
+        plane = torch.nn.functional.pad(found.board[:, :2], (0, 1), value=1.0)
+        flat = plane @ torch.linalg.lstsq(plane, found.board[:, 2:]).solution
+        bend = (found.board[:, 2:] - flat).abs().max().item()
+        said.append(f"the board is bent by {bend:.2g} of its unit: this is taken into account")
     return said
+
+
+def _longer(ratio: float) -> str:
+    return f"{100 * abs(ratio):.2g} % {'longer' if ratio > 0 else 'shorter'}"

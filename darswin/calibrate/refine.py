@@ -5,9 +5,11 @@ picture only, so the poses are eliminated first (the Schur complement).
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.lens import Lens, OCam, OCamInverse, Tabulated
@@ -20,6 +22,11 @@ OFF = 6.0  # standard deviations: a corner this far off does not fit
 SHARPEST = 0.05  # px: no detector finds corners better than this
 # The distance that 50 % and 97 % of the corners do not exceed, in standard deviations.
 MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
+# Stages of a refinement: the part of the corners whose largest distance gives the scale; this
+# distance in standard deviations; the smallest gain of a round. ROUGH follows the worst corners.
+ROUGH, FINE = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5)
+# The shape of a board, by which its points (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
+BEND, STRETCH = ("bend[0]", "bend[1]"), ("stretch",)
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
 HELD: dict[tuple[type[Lens], str], Any] = {
     (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
@@ -28,13 +35,14 @@ HELD: dict[tuple[type[Lens], str], Any] = {
 
 
 class Free:
-    """The free numbers of a lens as a vector (n,), and the lens of a vector.
+    """The free numbers of a lens and of the board as a vector (n,), and the lens of a vector.
 
-    Free are the parameters of the model and the principal point; and, unless pixels are square, the
-    ratio of their sides. OCam's linear term stays 0, and a table's angles stay as they are.
+    Free are the parameters of the model and the principal point; unless pixels are square, the
+    ratio of their sides; and the numbers of the board's shape with the names `shape`. OCam's linear
+    term stays 0, and a table's angles stay as they are.
     """
 
-    def __init__(self, lens: Lens, square_pixels: bool):
+    def __init__(self, lens: Lens, square_pixels: bool, shape: Sequence[str] = ()):
         tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
         tensors["center"] = lens.center
         held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
@@ -57,6 +65,14 @@ class Free:
         vector = self.packing.vector(tensors)
         self.start, self._rest = vector[free], torch.where(free, 0, vector)
         self._places = torch.eye(len(vector)).to(vector)[:, free]
+        # The lens has no part in the numbers of the board, which come last.
+        self.names += shape
+        self.shaped = torch.tensor([name in shape for name in (*BEND, *STRETCH)])
+        self.start, self._places = (F.pad(x, (0, len(shape))) for x in (self.start, self._places))
+        self.low, self.high = (
+            F.pad(x, (0, len(shape)), value=end)
+            for x, end in ((self.low, -math.inf), (self.high, math.inf))
+        )
 
     def tensors(self, vectors: Tensor) -> dict[str, Tensor]:
         """The parameters of the lenses of vectors (B, n)."""
@@ -79,6 +95,11 @@ class Free:
         limits = {"theta_max": theta_max.expand(len(vectors))}
         return self.model._from_tensors(self.tensors(vectors) | limits)
 
+    def shape(self, vector: Tensor) -> Tensor:
+        """(3,): the shape of the board of a vector (n,)."""
+        count = int(self.shaped.sum())
+        return vector.new_zeros(3).masked_scatter(self.shaped, vector[len(vector) - count :])
+
     def held(self, vector: Tensor, side: Tensor) -> Tensor:
         """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""
         return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
@@ -94,12 +115,17 @@ def pixels_of(lens: Lens, points: Tensor) -> Tensor:
 
 
 class State(NamedTuple):
-    """The free numbers, their lens, and the poses of the boards."""
+    """The free numbers, their lens, the poses of the boards, and the shape of all of them, (3,)."""
 
     vector: Tensor
     lens: Lens
     rotations: Tensor
     translations: Tensor
+    shape: Tensor = torch.zeros(3, dtype=torch.float64)
+
+    def of(self, which: Tensor) -> "State":
+        """The state of some pictures."""
+        return self._replace(rotations=self.rotations[which], translations=self.translations[which])
 
     def moved(self, free: Free, steps: Tensor, lens_moves: bool) -> "State | None":
         """The state after steps (P, n + 6); None if it has no lens."""
@@ -110,7 +136,8 @@ class State(NamedTuple):
             return None
         axes = torch.broadcast_tensors(steps[:, None, count:-3], torch.eye(3).to(steps))
         turns = torch.matrix_exp(torch.linalg.cross(*axes).mT)
-        return State(vector, lens, turns @ self.rotations, self.translations + steps[:, -3:])
+        shape = free.shape(vector) if lens_moves else self.shape
+        return State(vector, lens, turns @ self.rotations, self.translations + steps[:, -3:], shape)
 
 
 class Views(NamedTuple):
@@ -121,9 +148,24 @@ class Views(NamedTuple):
     seen: Tensor
     board: Tensor
 
+    def of(self, which: Tensor) -> "Views":
+        """Some of the pictures."""
+        return self._replace(corners=self.corners[which], seen=self.seen[which])
+
+    def shaped(self, shape: Tensor) -> Tensor:
+        """(K, 3): the points of a board with a shape (3,)."""
+        return self.board + (self.by_shape() * shape[:, None, None]).sum(0)
+
+    def by_shape(self) -> Tensor:
+        """(3, K, 3): the derivatives of the board's points by the numbers of its shape."""
+        x, y, z = self.board.unbind(-1)
+        bends = torch.stack((x.square(), y.square()))
+        slopes = (F.pad(bends[..., None], (2, 0)), torch.stack((z, y, z), -1)[None])
+        return torch.cat(slopes)
+
     def points(self, state: State) -> Tensor:
         """(P, K, 3): the board's points in the camera's frame."""
-        return self.board @ state.rotations.mT + state.translations[:, None]
+        return self.shaped(state.shape) @ state.rotations.mT + state.translations[:, None]
 
     def miss(self, state: State) -> Tensor:
         """(P, K, 2) px: by how much the lens misses the corners; 0 where not seen."""
@@ -144,8 +186,10 @@ class Views(NamedTuple):
         slopes = torch.where(there[..., None, None], slopes, 0.0)
         by_point = slopes[..., count:]
         # A turn ω moves a point by ω × turned.
-        turned = (self.board @ state.rotations.mT)[:, :, None].expand_as(by_point)
+        turned = (self.shaped(state.shape) @ state.rotations.mT)[:, :, None].expand_as(by_point)
         by_turn = torch.linalg.cross(turned, by_point)
+        along = torch.einsum("pij,skj->pkis", state.rotations, self.by_shape()[free.shaped])
+        slopes[..., count - along.shape[-1] : count] = by_point @ along
         return torch.cat((slopes[..., :count], by_turn, by_point), -1)
 
 
@@ -213,13 +257,15 @@ def _inverse(matrix: Tensor) -> Tensor:
 
 
 def refine(
-    views: Views, free: Free, state: State, lens_moves: bool = True, rough: bool = False
+    views: Views,
+    free: Free,
+    state: State,
+    lens_moves: bool = True,
+    stages: Sequence[tuple[float, float, float]] = (ROUGH, FINE),
 ) -> tuple[State, float]:
-    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss.
-
-    The scale follows the worst corners first; then, unless `rough`, the typical ones."""
+    """The state near a start with the smallest sum of Cauchy losses, and the scale of the loss."""
     sigma = math.inf
-    for part, typical, least_gain in ((0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5))[: 2 - rough]:
+    for part, typical, least_gain in stages:
         miss, damping, still = views.miss(state), 1e-3, 0
         for _ in range(ROUNDS):
             distance = miss.norm(dim=-1)[views.seen].quantile(part).item()

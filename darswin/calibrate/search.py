@@ -1,16 +1,16 @@
 """The search for a lens, and for the best model, from the corners of boards in pictures."""
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.calibrate import radial
 from darswin.calibrate.calibrated import CalibratedLens
-from darswin.calibrate.doubts import WRONG, doubts
+from darswin.calibrate.doubts import WRONG, doubts, misshapen
 from darswin.calibrate.inputs import (
     LEAST_PICTURES,
     CalibrationError,
@@ -18,9 +18,13 @@ from darswin.calibrate.inputs import (
     usable_pictures,
 )
 from darswin.calibrate.refine import (
+    BEND,
+    FINE,
     MEDIAN,
     OFF,
+    ROUGH,
     SHARPEST,
+    STRETCH,
     Free,
     Normal,
     State,
@@ -42,6 +46,9 @@ CANDIDATES = (
 # The terms off the curve that are found for a model.
 ASIDE = {"BrownConrady": {"tangential": 2}, "Mei": {"tangential": 2},
          "Fisheye624": {"tangential": 2, "prism": 4}}  # fmt: skip
+FOLDS = 5  # parts of the pictures, of which each is left out once
+FINALISTS, CLOSE = 3, 1.25  # models that are fitted to parts; their left_out, by the best
+PIXELS = ("affine[3]",)  # the ratio of a pixel's sides
 HOPELESS = 4.0  # times the standard deviation of a corner from another model
 
 
@@ -53,25 +60,27 @@ def calibrate(
     *,
     terms: int | None = None,
     names: Sequence[str] | None = None,
-    square_pixels: bool = True,
+    square_pixels: bool | None = None,
     accept: Callable[[Lens], bool] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibratedLens:
     """Finds the lens of a camera from the corners of a board in its pictures.
 
     It needs no guess, for fields of view up to 250°. Corners and pictures that do not fit the
-    others count little, and `doubts` names them.
+    others count little, and `doubts` names them. A board that is bent, or longer along one of its
+    sides, is found as well, if that is significant and predicts left-out pictures better.
 
     Args:
         corners: (P, K, 2) px, NaN where a corner was not seen; pixel centres are integers.
         board: a `Board`, or its points (K, 2), in any unit of length.
         size: (H, W) of the pictures.
-        model: a lens class, its name in `darswin.lens.MODELS`, or "auto": of many models, the one
-            that predicts left-out pictures best.
+        model: a lens class, its name in `darswin.lens.MODELS`, or "auto": of many models, the
+            simplest that predicts left-out pictures as well as the best, within its standard error.
         terms: the number of polynomial terms, or of the steps of a table. None means the model's
             default.
         names: those of the pictures, for messages. None means "picture 1", ….
-        square_pixels: False also finds the ratio of a pixel's sides.
+        square_pixels: False also finds the ratio of a pixel's sides, and True keeps it at 1. None
+            finds it if it is significant and predicts left-out pictures better.
         accept: a function of a lens: "auto" takes the best lens for which it is True, such as one
             that a file format holds. If there is none, it takes the best of all.
         progress: a function that is called with lines of text.
@@ -98,7 +107,7 @@ def calibrate(
         say(f"Refining the lens: {kind.__name__}")
         try:
             usual = min([WRONG * max(size) / HOPELESS, *(one.sigma for one in found)])
-            found.append(_find(kind, terms, views, start, size, square_pixels, usual))
+            found.append(_find(kind, terms, views, start, size, square_pixels is not False, usual))
         except (CalibrationError, torch.linalg.LinAlgError) as error:
             reason = (
                 error if isinstance(error, CalibrationError) else "Its equations have no solution."
@@ -113,8 +122,16 @@ def calibrate(
     for one in found:
         one.judge(views, counts)
     found.sort(key=lambda one: one.left_out)
+    taken = [one for one in found if accept is None or accept(one.state.lens)] or found
+    close = [one for one in taken if not one.left_out > CLOSE * taken[0].left_out][:FINALISTS]
+    for one in close:
+        say(f"Leaving out pictures: {one.free.model.__name__}")
+        other = one.leave_out(views, counts).with_more(views, counts, square_pixels)
+        if accept is None or not accept(one.state.lens) or accept(other.state.lens):
+            found[found.index(one)] = close[close.index(one)] = other
+    best = _simplest(close)
+    found.sort(key=lambda one: (one is not best, one.left_out))
     table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
-    best = next((one for one in found if accept is None or accept(one.state.lens)), found[0])
     miss = best.miss
     middle, unit = points.mean(0), (points - points.mean(0)).norm(dim=1).max()
     spot = torch.cat((middle, middle.new_zeros(1)))
@@ -131,6 +148,7 @@ def calibrate(
         lens=lens,
         rotations=all_pictures(best.state.rotations),
         translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
+        board=unit * views.shaped(best.state.shape) + spot,
         residuals=all_pictures(torch.where(seen[..., None], miss, torch.nan)),
         weights=all_pictures(weights_of(miss, best.scale) * (seen & best.used[:, None]), 0.0),
         theta=all_pictures(torch.where(seen, theta, torch.nan)),
@@ -148,9 +166,8 @@ def calibrate(
         _vector=best.state.vector,
         _joint=best.joint,
     )
-    picture, board = best.stretch(views, counts)
-    stretch = picture if square_pixels else 0.0, board  # else the lens has the ratio of its pixels
-    result.doubts.extend(doubts(result, whole.seen, spot, stretch))
+    result.doubts.extend(doubts(result, whole.seen, spot))
+    result.doubts.extend(misshapen(result, best.state.shape, best.confounded))
     return result
 
 
@@ -168,7 +185,9 @@ class _Found:
     """A lens of one model with the poses, and what is known of them."""
 
     error = left_out = math.nan
+    confounded = False  # the board's stretch may be that of the pixels
     joint: Tensor
+    squares: Tensor
 
     def __init__(self, free: Free, state: State, scale: float, views: Views, used: Tensor):
         self.free, self.state, self.scale, self.used = free, state, scale, used
@@ -191,44 +210,101 @@ class _Found:
             moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
             self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
 
-    def stretch(self, views: Views, counts: Tensor) -> tuple[float, float]:
-        """How much longer than in x things seem in y, as a part of their length: in the picture,
-        and on the board; 0 if it may be chance. Boards that never turn in the picture cannot tell
-        one from the other, and both are then the same."""
-        free = Free(self.state.lens, square_pixels=False)
-        miss, used, slopes, alone = self._normal(views, counts, free)
-        last, least = len(free.start), OFF * max(self.sigma, SHARPEST)
-        # One more number of all pictures moves the board's points along its y axis.
-        along = self.state.rotations[counts.any(1), None, :, 1] * views.board[:, 1:2]
-        slopes = torch.cat(
-            (slopes[..., :last], slopes[..., -3:] @ along[..., None], slopes[..., last:]), -1
-        )
-        free.low, free.high = (
-            F.pad(e, (0, 1), value=v) for e, v in ((free.low, -math.inf), (free.high, math.inf))
-        )
-        vector = F.pad(free.start, (0, 1), value=1.0)
-        both = Normal(slopes, miss, used.to(miss), free, vector).damped(0.0)
+    def leave_out(self, views: Views, counts: Tensor) -> "_Found":
+        """Computes `squares` (P,), the sums of the squared misses in each picture of a lens that
+        was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
+        pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
+        self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
+        parts = [pictures[k::FOLDS] for k in range(min(FOLDS, len(pictures)))]
+        for part in parts if len(pictures) > LEAST_PICTURES else [pictures]:
+            rest = pictures[~torch.isin(pictures, part)]
+            self.squares[part] = math.nan
+            if len(rest) < LEAST_PICTURES:
+                continue
+            with contextlib.suppress(torch.linalg.LinAlgError):
+                without, _ = refine(
+                    views._replace(seen=seen).of(rest),
+                    self.free,
+                    self.state.of(rest),
+                    stages=[FINE],
+                )
+                poses = self.state.of(part)
+                state = without._replace(rotations=poses.rotations, translations=poses.translations)
+                mine = views.of(part)
+                state, _ = refine(mine, self.free, state, lens_moves=False, stages=[FINE])
+                miss = mine.miss(state).square().sum(-1)
+                self.squares[part] = torch.where(counts[part], miss, 0.0).sum(1)
+        self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
+        return self
 
-        def sure(normal: Normal, place: int) -> float:
-            found, variance = normal.steps()[0, place].item(), normal.covariance()[place, place]
-            return found if abs(found) > least * math.sqrt(variance.item()) else 0.0
+    def with_more(self, views: Views, counts: Tensor, square_pixels: bool | None) -> "_Found":
+        """The same with the ratio of a pixel's sides and the shape of the board, as far as they
+        are significant, if they predict left-out pictures better."""
+        names, confounded = self._significant(views, counts, square_pixels is None)
+        if not names:
+            return self
+        square = square_pixels is not False and PIXELS[0] not in names
+        free = Free(self.state.lens, square, [name for name in names if name not in PIXELS])
+        state = State(free.start, *self.state[1:])
+        state, scale = refine(
+            views._replace(seen=views.seen & self.used[:, None]), free, state, stages=[FINE]
+        )
+        other = _Found(free, state, scale, views, self.used)
+        other.judge(views, counts)
+        other.confounded = confounded and STRETCH[0] in names
+        other.leave_out(views, counts)
+        return other if other.left_out < self.left_out else self
 
-        picture, board = sure(both, last - 1), sure(both, last)
-        if not (picture or board):
-            picture = board = sure(alone, last - 1)
-        return picture, board
+    def _significant(self, views: Views, counts: Tensor, pixels: bool) -> tuple[list[str], bool]:
+        """The names of the ratio of a pixel's sides, if it may change, and of the numbers of the
+        board's shape that are no chance, to first order; and whether boards that never turn in the
+        picture cannot tell its stretch from that of the pixels."""
+        open_ = [*[PIXELS] * pixels, BEND, STRETCH]
+        extra = {name for group in open_ for name in group}
+        square = not pixels and PIXELS[0] not in self.free.names
+        free, confounded = Free(self.state.lens, square, (*BEND, *STRETCH)), False
+        miss, counts, slopes, _ = self._normal(views, counts, free)
+        low, high = free.low, free.high
+        while open_:
+            stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
+            free.low, free.high = (torch.where(stay, free.start, end) for end in (low, high))
+            normal = Normal(slopes, miss, counts.to(miss), free, free.start).damped(0.0)
+            step, covariance = normal.steps()[0], normal.covariance()
+            sure = {}
+            for group in open_:
+                at = [free.names.index(name) for name in group]
+                value = step[at]
+                squared = value @ torch.linalg.solve(covariance[at][:, at], value)
+                sure[group] = squared.sqrt().item() / max(self.sigma, SHARPEST)
+            chance = [group for group in open_ if not sure[group] > OFF]
+            if not chance:
+                break
+            both = PIXELS in chance and STRETCH in chance
+            confounded |= both
+            open_.remove(PIXELS if both else min(chance, key=lambda group: sure[group]))
+        return [name for group in open_ for name in group], confounded
 
     def _normal(
         self, views: Views, counts: Tensor, free: Free
     ) -> tuple[Tensor, Tensor, Tensor, Normal]:
         """Misses, counts, slopes and equations of the pictures with corners that count, (P, K)."""
-        used, (_, lens, rotations, translations) = counts.any(1), self.state
+        used = counts.any(1)
         vector = self.state.vector if free is self.free else free.start
-        views = Views(views.corners[used], views.seen[used], views.board)
-        slopes = views.slopes(free, State(vector, lens, rotations[used], translations[used]))
+        slopes = views.of(used).slopes(free, self.state.of(used)._replace(vector=vector))
         miss, counts = self.miss[used], counts[used]
         normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
         return miss, counts, slopes, normal
+
+
+def _simplest(found: list[_Found]) -> _Found:
+    """The one with the fewest numbers that misses left-out pictures by no more than the best does,
+    within the standard error of the difference."""
+    best = min(found, key=lambda one: one.left_out)
+    for one in sorted(found, key=lambda one: len(one.state.vector)):
+        more = one.squares - best.squares
+        if more.sum() <= math.sqrt(len(more)) * more.std():
+            return one
+    return best
 
 
 def _state(lens: Lens, square_pixels: bool, poses: tuple[Tensor, Tensor]) -> tuple[Free, State]:
@@ -252,11 +328,11 @@ def _find(
     poses = radial.poses(rays, views.seen.to(rays), board)
     free, state = _state(start.lens(model, terms, top, size), square_pixels, poses)
     agreeing = views._replace(seen=views.seen & used[:, None])
-    state, scale = refine(agreeing, free, state, rough=True)
+    state, scale = refine(agreeing, free, state, stages=[ROUGH])
     if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
         free, state = _state(state.lens.replace(**zeros), square_pixels, state[2:])
-        state, scale = refine(agreeing, free, state, rough=True)
+        state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
     if found.sigma > HOPELESS * max(usual, SHARPEST):
         return found

@@ -37,7 +37,7 @@ def calibrate(
     pictures: Sequence[str] = (), *, board: str, square: float, kind: Kind = "chessboard",
     marker: float | None = None, gap: float | None = None, dictionary: str | None = None,
     model: str = "auto", out: str = "camera.json", picture: str | None = None,
-    report: str | None = None, format: Format | None = None, square_pixels: bool = True,
+    report: str | None = None, format: Format | None = None, square_pixels: bool | None = None,
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
@@ -56,13 +56,13 @@ def calibrate(
         dictionary: the markers, as OpenCV names them. The default is 4X4_250 for ChArUco boards and
             APRILTAG_36h11 for AprilTags.
         model: the lens model, a name of darswin.lens.MODELS; or auto: of many that the file can
-            hold, the one that predicts left-out pictures best.
+            hold, the simplest of those that predict left-out pictures best.
         out: the calibration to write.
         picture: a figure to write: the corners, what they miss, how sure the lens is.
         report: a JSON file to write with all that was found.
         format: the format of the calibration, as for `darswin lens convert`.
-        square_pixels: whether the camera's pixels are square. With false, the ratio of their sides
-            is found too, which needs more pictures.
+        square_pixels: whether the camera's pixels are square. The default is to find the ratio of
+            their sides if left-out pictures then fit better; false always finds it.
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
@@ -260,7 +260,7 @@ def _label(doubt: str, seen: _Seen) -> str:
         "corners reach",
         *["no board found"] * (len(seen.without) <= len(seen.names)),
     ]
-    parts = "and is left out", "more corners are off"
+    parts = "and is left out", "more corners are off", "this is in", "this is taken into account"
     is_usual = doubt.startswith(tuple(usual)) or any(part in doubt for part in parts)
     return "note" if is_usual else "looks wrong"
 

@@ -1,5 +1,6 @@
 """Calibration against rigs whose lens and poses are known."""
 
+import dataclasses
 import json
 import math
 import re
@@ -12,7 +13,7 @@ from rigs import WIDEST, board, f64, ray_errors, rig, true_lens, turn
 from torch.testing import assert_close
 
 from darswin.calibrate import CalibrationError, calibrate
-from darswin.calibrate.doubts import _stretched
+from darswin.calibrate.doubts import doubts
 from darswin.calibrate.refine import Free, State, Views, refine
 from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
 from darswin.lens.solve import direction_of, vector_of
@@ -157,7 +158,8 @@ def test_a_mirrored_board_is_named(usual):
 def test_it_is_saved_and_described(usual, tmp_path):
     said = []
     found = of(usual, progress=said.append)
-    assert said == ["Finding a start from 12 pictures", "Refining the lens: KannalaBrandt"]
+    steps = "Finding a start from 12 pictures", "Refining the lens: ", "Leaving out pictures: "
+    assert said == [steps[0], *(step + "KannalaBrandt" for step in steps[1:])]
     # θ_max is the sensor's, or where the curve ends.
     assert found.lens.theta_max == min(found.lens.side_angles().max(), found.lens.theta_limit)
     described = json.loads(json.dumps(found.to_dict(), allow_nan=False))
@@ -173,7 +175,7 @@ def test_the_best_model_predicts_left_out_pictures(usual):
     found = of(usual, "auto")
     table = {model: (left_out, reason) for model, left_out, _, reason in found.models}
     assert found.models[0][0] == type(found.lens).__name__
-    assert found.left_out == found.models[0][1] <= table["KannalaBrandt"][0]
+    assert found.left_out == found.models[0][1] <= 1.02 * table["KannalaBrandt"][0]
     assert table["Equisolid"][0] > 2 * found.left_out
     assert "the axis, but a Perspective lens ends at 90°" in table["Perspective"][1]
     assert ray_errors(found.lens, usual.lens, best=True).median() < 0.04
@@ -199,51 +201,80 @@ def stretched(found, ratio):
     return found._replace(corners=torch.where(outside, torch.nan, corners))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["KannalaBrandt", "Mei", "Perspective"])
-def test_pixels_that_are_not_square_are_doubted(model):
+@pytest.mark.parametrize("model", slow_but(["KannalaBrandt", "Mei", "Perspective"], "Mei"))
+def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model):
     true = rig(true_lens(model, 100, seed=3), 12, noise=0.2, seed=3)
-    for ratio, words in ((1.05, "% longer than"), (0.95, "% shorter than"), (1.0, None)):
-        seen = stretched(true, ratio)
-        doubts = [text for text in of(seen, model).doubts if "lengths along y" in text]
-        assert len(doubts) == (words is not None) and (not doubts or words in doubts[0])
-        found = of(seen, model, square_pixels=False)
-        assert not [text for text in found.doubts if "lengths along y" in text]
+    for ratio, words in ((1.05, "5 % longer"), (0.99, "1 % shorter"), (1.0, None)):
+        found = of(stretched(true, ratio), model)
+        assert found.lens._affine()[0, 1, 1].item() == pytest.approx(ratio, abs=2e-3)
+        said = [text for text in found.doubts if text.startswith("lengths along y are ")]
+        assert len(said) == ("affine[3]" in found.parameters) == (words is not None)
+        assert not said or re.match(rf"lengths along y are [\d.]+ % {words[4:]} than", said[0])
+    square = of(stretched(true, 1.05), model, square_pixels=True)
+    assert "affine[3]" not in square.parameters and square.left_out > 2 * found.left_out
 
 
-def test_a_stretched_board_is_doubted():
+@pytest.mark.parametrize(("ratio", "square"), [(1.01, None), (0.99, False), (1.01, True)])
+def test_a_stretched_board_is_found(ratio, square):
     lens = true_lens("KannalaBrandt", 120, seed=1)
-    for ratio, square, words in (
-        (1.01, True, "1 % longer"),
-        (0.99, False, "1 % shorter"),
-        (1, 1, ""),
-    ):
-        seen = rig(lens, 12, board() * torch.tensor([1, ratio]), noise=0.05)
-        found = calibrate(
-            seen.corners, board(), seen.size, "KannalaBrandt", square_pixels=bool(square)
-        )
-        doubts = [text for text in found.doubts if "along" in text]
-        assert len(doubts) == bool(words)
-        assert not doubts or re.match(
-            "the board seems (0.9[6-9]|1) % (long|short)er along", doubts[0]
-        )
-        assert not doubts or words[4:] in doubts[0]
+    seen = rig(lens, 12, board() * torch.tensor([1, ratio]), noise=0.05)
+    found = calibrate(seen.corners, board(), seen.size, "KannalaBrandt", square_pixels=square)
+    assert ray_errors(found.lens, lens, best=True).max() < 0.03 and "stretch" in found.parameters
+    tall, wide = found.board[-1, :2] - found.board[0, :2], (board()[-1] - board()[0])
+    assert ((tall / wide)[1] / (tall / wide)[0]).item() == pytest.approx(ratio, abs=5e-4)
+    (said,) = [text for text in found.doubts if text.startswith("the board is ")]
+    assert ("longer along its columns" if ratio > 1 else "shorter along its columns") in said
 
 
-def test_words_for_pixels_and_boards_that_are_stretched():
-    said = ["of the pixels or of the board: measure"], ["the board seems"], ["seem 1 % longer"], []
-    for stretch, words in zip(((0.01, 0.01), (0, 0.01), (0.01, 0), (0, 0)), said, strict=True):
-        found = _stretched(*stretch)
-        assert len(found) == len(words) and all(map(str.__contains__, found, words))
+def seen_by(lens, solid, rotations, translations, noise=0.05):
+    """The corners of solid boards (K, 3) in their poses."""
+    pixels = lens.project_points(solid @ rotations.mT + translations[:, None])
+    generator = torch.Generator().manual_seed(0)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=f64)
+    sides = lens.image_size[0].flip(0) - 1
+    return torch.where(((pixels >= 0) & (pixels <= sides)).all(-1, keepdim=True), pixels, math.nan)
+
+
+def test_a_bent_board_is_found():
+    lens = true_lens("KannalaBrandt", 100, seed=1)
+    true = rig(lens, 12, noise=0.0)
+    across = (true.board - true.board.mean(0))[:, :1]
+    sag = 2e-3 * (1 - (across / across.max()).square())
+    solid = torch.cat((true.board, sag), 1)
+    corners = seen_by(lens, solid, true.rotations, true.translations)
+    found = calibrate(corners, true.board, true.size, "KannalaBrandt")
+    assert ray_errors(found.lens, lens, best=True).quantile(0.95) < 0.03
+    assert {"bend[0]", "bend[1]"} < {*found.parameters} and found.left_out < 0.08
+    assert_close(found.board[:, 2:] - found.board[:1, 2:], sag - sag[0], rtol=0, atol=1e-4)
+    # The poses are those of the bent board.
+    places = found.board @ found.rotations.mT + found.translations[:, None]
+    there = ~corners.isnan().any(-1)
+    residuals = found.lens.with_theta_max(None).project_points(places) - corners
+    assert_close(residuals[there], found.residuals[there], rtol=0, atol=1e-6)
+    assert [text for text in found.doubts if text.startswith("the board is bent by 0.001")]
+
+
+def test_boards_that_never_turn_cannot_tell_their_ratio_from_that_of_the_pixels():
+    lens = true_lens("KannalaBrandt", 60, shift=0.0)
+    generator = torch.Generator().manual_seed(0)
+    u = torch.rand(14, 5, generator=generator, dtype=f64) - 0.5
+    rotations = turn(torch.nn.functional.pad(1.2 * u[:, :2] * torch.eye(2)[[0, 1] * 7], (0, 1)))
+    middle = torch.stack((0.2 * u[:, 2], 0.2 * u[:, 3], 0.45 + 0.2 * u[:, 4]), -1)
+    solid = torch.nn.functional.pad(board() - board().mean(0), (0, 1))
+    corners = seen_by(lens, solid * torch.tensor([1, 1.01, 1]), rotations, middle)
+    found = calibrate(corners, board(), (960, 1000), "KannalaBrandt")
+    (said,) = [text for text in found.doubts if "along y" in text]
+    assert "of the pixels or of the board" in said and "turn it by a quarter" in said
+    assert "resized" not in said
 
 
 @pytest.mark.slow
 def test_left_out_is_the_error_of_pictures_that_were_left_out():
-    true = rig(true_lens("KannalaBrandt", 180), 6, noise=0.5)
+    true = rig(true_lens("KannalaBrandt", 180), 5, noise=0.5)
     found = of(true)
     total, count = 0.0, 0
-    for k in range(6):
-        rest = of(true._replace(corners=true.corners[[i for i in range(6) if i != k]]))
+    for k in range(5):
+        rest = of(true._replace(corners=true.corners[[i for i in range(5) if i != k]]))
         # The lens without the picture, and the best pose of the picture in it.
         unit = (true.board - true.board.mean(0)).norm(dim=1).max()
         flat = (true.board - true.board.mean(0)) / unit
@@ -256,7 +287,7 @@ def test_left_out_is_the_error_of_pictures_that_were_left_out():
         state, _ = refine(views, Free(lens, True), state, lens_moves=False)
         total += views.miss(state).square().sum().item()
         count += int(seen.sum())
-    assert found.left_out == pytest.approx(math.sqrt(total / count), rel=0.05)
+    assert found.left_out == pytest.approx(math.sqrt(total / count), rel=0.01)
     assert found.left_out > found.error
 
 
@@ -323,13 +354,16 @@ def test_a_wrong_model_makes_no_outlier_count(usual):
 def test_the_best_model_that_is_accepted_is_taken(usual):
     table = [name for name, *_ in of(usual, "auto").models]
     found = of(usual, "auto", accept=lambda lens: type(lens).__name__ == table[2])
-    assert [name for name, *_ in found.models] == table and type(found.lens).__name__ == table[2]
+    assert found.models[0][0] == type(found.lens).__name__ == table[2]
+    assert {name for name, *_ in found.models} == {*table}
     assert type(of(usual, "auto", accept=lambda lens: False).lens).__name__ == table[0]
 
 
-@pytest.mark.parametrize(("pictures", "noise", "limit"), [(4, 2.0, 0.3), (4, 0.2, 1.6)])
-def test_left_out_pictures_that_are_missed_are_doubted(pictures, noise, limit):
-    lens = true_lens("KannalaBrandt", 190).with_theta_max(limit)
-    found = of(rig(lens, pictures, noise=noise, least=10))
-    doubted = [text for text in found.doubts if text.startswith("pictures that were left out")]
-    assert bool(doubted) == (found.left_out > 4 * found.sigma) == (noise == 2.0)
+def test_left_out_pictures_that_are_missed_are_doubted(usual):
+    found = of(usual)
+    for times in (1.5, 5.0):
+        found = dataclasses.replace(found, left_out=times * found.sigma)
+        said = doubts(found, ~usual.corners.isnan().any(-1), torch.zeros(3, dtype=f64))
+        assert len([text for text in said if "that were left out are missed" in text]) == (
+            times > 4
+        )
