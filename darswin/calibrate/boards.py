@@ -15,6 +15,7 @@ from darswin.utils.parameters import check
 Kind = Literal["chessboard", "charuco", "april"]
 
 LEAST_SIDE = 16  # px: smaller pictures show nothing
+TRIPLES = 2000  # of points of the rim
 SIDE = 1200  # px, to which larger pictures are reduced at first
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
@@ -204,14 +205,31 @@ def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] |
         return None
     rim = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64)
     rim = rim[((rim > 1) & (rim < (width - 2, height - 2))).all(1)]
-    # Dents, such as a dark board makes, are inside of the smallest circle.
-    (x, y), radius = cv2.minEnclosingCircle(rim.astype(np.float32))
-    near = np.abs(np.hypot(*(rim - (x, y)).T) - radius) < max(2.0, 0.015 * radius)
-    if near.sum() < max(16, 0.6 * len(rim)):
+    # Circles through three points of the rim. Many more must be near the right one. Dents, such as
+    # dark boards make, are inside of it, and nothing is outside.
+    rows, squares = np.column_stack((2 * rim, np.ones(len(rim)))), np.square(rim).sum(1)
+    chosen = np.random.default_rng(0).integers(len(rim) or 1, size=(TRIPLES, 3))[
+        : TRIPLES * len(rim)
+    ]
+    chosen = chosen[np.abs(np.linalg.det(rows[chosen])) > 1e-3 * width**2]
+    most, near = 0, np.zeros(len(rim), bool)
+    for a, b, c in np.linalg.solve(rows[chosen], squares[chosen][..., None])[..., 0]:
+        radius = math.sqrt(c + a * a + b * b)
+        off, step = np.hypot(*(rim - (a, b)).T) - radius, max(2.0, 0.015 * radius)
+        count = (np.abs(off) < step).sum() - 2 * (off > step).sum()
+        if count > most and radius < max(height, width):
+            most, near = count, np.abs(off) < step
+    if near.sum() < 16:
         return None
-    terms = np.column_stack((2 * rim, np.ones(len(rim))))[near]
-    a, b, c = np.linalg.lstsq(terms, (rim**2).sum(1)[near], rcond=None)[0].tolist()
-    return a, b, math.sqrt(c + a * a + b * b)
+    a, b, c = np.linalg.lstsq(rows[near], squares[near], rcond=None)[0].tolist()
+    radius = math.sqrt(c + a * a + b * b)
+    # Of the circle that the picture shows, a large part must be there.
+    turn = np.arange(360)
+    x, y = a + radius * np.cos(np.radians(turn)), b + radius * np.sin(np.radians(turn))
+    shown = (x > 1) & (x < width - 2) & (y > 1) & (y < height - 2)
+    found = np.degrees(np.arctan2(rim[near, 1] - b, rim[near, 0] - a)) % 360
+    there = np.isin(turn, found.astype(int)) & shown
+    return (a, b, radius) if there.sum() >= max(90, 0.7 * shown.sum()) else None
 
 
 def _scales(grey: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:

@@ -38,6 +38,7 @@ def calibrate(
     marker: float | None = None, gap: float | None = None, dictionary: str | None = None,
     model: str = "auto", out: str = "camera.json", picture: str | None = None,
     report: str | None = None, format: Format | None = None, square_pixels: bool | None = None,
+    theta_max_deg: float | None = None,
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
@@ -63,6 +64,8 @@ def calibrate(
         format: the format of the calibration, as for `darswin lens convert`.
         square_pixels: whether the camera's pixels are square. The default is to find the ratio of
             their sides if left-out pictures then fit better; false always finds it.
+        theta_max_deg: the largest incident angle of the lens, in degrees. The default is that of
+            the image circle, if the pictures have one, or else of the picture's sides.
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
@@ -76,6 +79,8 @@ def calibrate(
         from darswin.viz.plot import figure_format
 
         figure_format(picture)
+    if theta_max_deg is not None:
+        check("theta_max_deg", theta_max_deg, 0 < theta_max_deg <= 180, "above 0, at most 180")
     check_paths(pictures)
     names = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
     outs = {"out": out, "picture": picture, "report": report}
@@ -100,7 +105,7 @@ def calibrate(
             square_pixels=square_pixels, accept=lambda lens: is_held(lens, out, format),
             progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
-    lens = _within(seen.brightest, found.lens)
+    lens = _within(seen.brightest, found.lens, theta_max_deg)
     print(_summary(found, seen, lens))
     try:
         write_lens(lens, out, format)
@@ -240,10 +245,13 @@ def _listed(names: Collection[str]) -> str:
     return ", ".join([*names][:LISTED]) + more
 
 
-def _within(brightest: "np.ndarray", lens: Lens) -> Lens:
-    """The lens with the θ_max of the image circle, if the pictures have one."""
+def _within(brightest: "np.ndarray", lens: Lens, degrees: float | None) -> Lens:
+    """The lens with this θ_max, or that of the image circle, if the pictures have one."""
     from darswin.calibrate.boards import image_circle
 
+    if degrees is not None:
+        limit = lens.with_theta_max(None).theta_max.item()
+        return lens.with_theta_max(min(math.radians(degrees), limit))
     if (circle := image_circle([brightest])) is None:
         return lens
     x, y, radius = circle

@@ -221,6 +221,18 @@ def test_the_image_circle_is_that_of_the_lens(size):
     np.testing.assert_allclose(image_circle(dark), (x, y, 205), atol=2.5)
 
 
+def test_a_circle_that_is_cut_and_dented_is_found():
+    y, x = np.mgrid[:480, :748]
+    picture = np.where(np.hypot(x - 380.0, y - 236.0) < 290, 220, 6).astype(np.uint8)
+    for left, top, right, bottom in (
+        (90, 100, 130, 300),
+        (600, 330, 700, 420),
+        (250, 430, 560, 480),
+    ):
+        picture[top:bottom, left:right] = 8
+    np.testing.assert_allclose(image_circle([picture]), (380, 236, 290), atol=1.5)
+
+
 def test_pictures_without_a_circle_have_none(one):
     view, rng = camera(80), np.random.default_rng(0)
     (pose,) = view.poses(CHESSBOARD, 1, rng)

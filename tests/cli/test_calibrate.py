@@ -181,7 +181,8 @@ def test_models_that_the_format_cannot_hold_are_not_taken(folder, capsys, monkey
     calibrate("boards", *BOARD, "--model=auto", f"--out={out}")
     printed = capsys.readouterr().out
     rows = [line.split()[0] for line in printed.splitlines()]
-    assert rows[rows.index("model") :][1:3] == ["OCam", "Equidistant"]
+    first, second = rows[rows.index("model") + 1 :][:2]  # the one that was taken is the first
+    assert first == model and {first, second} == {"OCam", "Equidistant"}
     assert type(lens.load(out)).__name__ == model
 
 
@@ -272,3 +273,11 @@ def test_misuse_is_refused_before_any_picture_is_read(folder, capsys, monkeypatc
         calibrate("boards", *options)
     assert end.value.code == 2
     assert re.search(said, capsys.readouterr().err)
+
+
+def test_the_largest_angle_is_taken(folder, capsys):
+    calibrate("boards", *BOARD, "--theta_max_deg=80", "--out=made.json")
+    assert lens.load("made.json").theta_max.item() == pytest.approx(math.radians(80))
+    capsys.readouterr()
+    said = refusal(capsys, "boards", *BOARD, "--theta_max_deg=0")
+    assert "--theta_max_deg must be above 0" in said
