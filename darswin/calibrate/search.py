@@ -18,6 +18,7 @@ from darswin.calibrate.inputs import (
     usable_pictures,
 )
 from darswin.calibrate.refine import (
+    AGAIN,
     BEND,
     FINE,
     MEDIAN,
@@ -226,12 +227,12 @@ class _Found:
                     views._replace(seen=seen).of(rest),
                     self.free,
                     self.state.of(rest),
-                    stages=[FINE],
+                    stages=[AGAIN],
                 )
                 poses = self.state.of(part)
                 state = without._replace(rotations=poses.rotations, translations=poses.translations)
                 mine = views.of(part)
-                state, _ = refine(mine, self.free, state, lens_moves=False, stages=[FINE])
+                state, _ = refine(mine, self.free, state, lens_moves=False, stages=[AGAIN])
                 miss = mine.miss(state).square().sum(-1)
                 self.squares[part] = torch.where(counts[part], miss, 0.0).sum(1)
         self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
@@ -331,7 +332,9 @@ def _find(
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
     if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
-        free, state = _state(state.lens.replace(**zeros), square_pixels, state[2:])
+        free, state = _state(
+            state.lens.replace(**zeros), square_pixels, (state.rotations, state.translations)
+        )
         state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
     if found.sigma > HOPELESS * max(usual, SHARPEST):
