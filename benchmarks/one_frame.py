@@ -213,8 +213,8 @@ class Camera(NamedTuple):
 
 @cache
 def camera_of(name: str, folder: Path) -> Camera:
-    model, camera = model_of(name, MODELS[name][0]), lens.load(EXAMPLES / "front.json")
-    frame = cv2.imread(str(EXAMPLES / "front.jpg"))[..., ::-1].copy()
+    model, camera = model_of(name, MODELS[name][0]), lens.load(EXAMPLES / "room.json")
+    frame = cv2.imread(str(EXAMPLES / "room.jpg"))[..., ::-1].copy()
     network, plan, graph = (
         str(folder / f"{name}.{kind}")
         for kind in ("network.safetensors", "plan.safetensors", "tokens.onnx")

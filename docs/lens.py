@@ -1,5 +1,5 @@
-"""Draws docs/lens.png and docs/polar.png, and writes examples/front.jpg and its calibration
-examples/front.json. The picture is a computed room through a lens of our own, which sees 190° from
+"""Draws docs/lens.png and docs/polar.png, and writes examples/room.jpg and its calibration
+examples/room.json. The picture is a computed room through a lens of our own, which sees 190° from
 left to right.
 
 Run it with `.venv/bin/python docs/lens.py`. The room is a box with a checkerboard on its walls, so
@@ -41,7 +41,7 @@ COLOURS = np.array([
 
 
 def front_lens() -> Polynomial:
-    """The lens of examples/front.json, used as far as the image's sides."""
+    """The lens of examples/room.json, used as far as the image's sides."""
     lens = Polynomial(COEFFICIENTS, center=[641.3, 486.1], image_size=SIZE).to(torch.float64)
     return lens.with_theta_max(lens.side_angles().amax())
 
@@ -88,9 +88,9 @@ def main() -> None:
     image = photograph(lens)
     picture = io.BytesIO()
     Image.fromarray(image).save(picture, format="jpeg", quality=80, optimize=True)
-    replace_file(EXAMPLES / "front.jpg", picture.getvalue())
+    replace_file(EXAMPLES / "room.jpg", picture.getvalue())
     calibration = dict(zip(("k1", "k2", "k3", "k4"), COEFFICIENTS, strict=True)) | OFFSETS
-    replace_file(EXAMPLES / "front.json", json.dumps({"intrinsic": calibration}, indent=2) + "\n")
+    replace_file(EXAMPLES / "room.json", json.dumps({"intrinsic": calibration}, indent=2) + "\n")
     view = PerspectiveView((604, 800), fov=math.radians(110))
     sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")

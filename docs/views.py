@@ -21,8 +21,8 @@ SINGLE = ("square", "perspective", "stereographic", "equirectangular", "cylindri
 
 def draw_views() -> Figure:
     """The picture, single views of it, and its five tiles."""
-    image, _ = read_oriented(ROOT / "examples" / "front.jpg", 3)
-    camera = load(ROOT / "examples" / "front.json")
+    image, _ = read_oriented(ROOT / "examples" / "room.jpg", 3)
+    camera = load(ROOT / "examples" / "room.json")
     images = torch.from_numpy(image)[None]
     figure = page_figure(4.6)
     grid = figure.add_gridspec(3, 20)

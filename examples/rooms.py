@@ -4,7 +4,7 @@ pixel, as a plain folder of `darswin.data.open_scenes`.
     python examples/rooms.py rooms --count 60
 
 The rooms have a floor, walls, a ceiling and boxes of random sizes and colours. The camera is that
-of examples/front.json, at a quarter of its size.
+of examples/room.json, at a quarter of its size.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from darswin import lens
 from darswin.lens.pixels import pixel_rays
 
-CALIBRATION = Path(__file__).with_name("front.json")
+CALIBRATION = Path(__file__).with_name("room.json")
 SIZE = (242, 320)
 CLASSES = {
     "names": ["floor", "wall", "ceiling", "box"],

@@ -8,6 +8,7 @@ from torch import nn
 
 from darswin import create_model, frames
 from darswin.deploy import camera
+from darswin.deploy.quantize import quantize_model
 from darswin.lens import Equidistant
 
 MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
@@ -49,15 +50,14 @@ def bilinear(image, x, y):
     return top * (1 - lower) + bottom * lower
 
 
-def model_of(family="darswin_a", channels=3, **options):
-    """A small model whose signal neither grows nor dies."""
+def model_of(family="darswin_a", channels=3, *, size="nano", **options):
+    """A model of a family whose signal neither grows nor dies."""
     torch.manual_seed(0)
     if family.startswith("swin_unet"):
         options = dict(image_size=64) | options
     mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
-    model = create_model(
-        f"{family}_nano", **(dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options)
-    ).eval()
+    options = dict(num_classes=10, mean=mean, std=std, in_chans=channels) | options
+    model = create_model(f"{family}_{size}", **options).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
@@ -66,6 +66,11 @@ def model_of(family="darswin_a", channels=3, **options):
 
 def size_of(model):
     return model.image_size or (70, 80)
+
+
+def quantized_of(model):
+    pictures = torch.from_numpy(random_frame(*size_of(model), 3, 2)).permute(3, 2, 0, 1)
+    return quantize_model(model, [(pictures, ROUND)])
 
 
 def network_of(model, folder, lens=ROUND, **options):

@@ -11,7 +11,7 @@ import torch
 
 import darswin
 
-LENS = Path(__file__).parent.parent / "examples" / "front.json"
+LENS = Path(__file__).parent.parent / "examples" / "room.json"
 # Importing each of these takes a part of a second or more.
 HEAVY = {
     "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "onnx", "sklearn", "sympy",

@@ -33,6 +33,8 @@ enum class Opcode : int64_t {
   to_image,  // x, out, R, A, channels, H, W, plan: polar_to_image
   distance,  // x, in place, typical distance as the bits of a float
   pool,      // x, out, H, W, channels: the largest of 2 x 2 pixels, also of fewer at the ends
+  deform,    // as block, with queries for qkv, in float, and one window; then groups, kernel,
+             // reach as the bits of a float, convolution, norm, offset, kv (see Deformable)
 };
 
 constexpr int64_t kCopyAxes = 5;
@@ -77,13 +79,17 @@ class Network {
     Norm norm{};
     Layer layer{};
     Block block{};
+
+    bool is_block() const { return opcode == Opcode::block || opcode == Opcode::deform; }
   };
   struct Run;
 
   Step checked(Opcode opcode, const int64_t* arguments) const;
   Layer layer_at(int64_t offset, int64_t depth, int64_t columns, int64_t is_quantized) const;
   Norm norm_at(int64_t offset, int64_t dim) const;
-  Block block_of(const int64_t* arguments) const;
+  const float* weights_at(int64_t offset, int64_t count) const;
+  Block block_of(const int64_t* arguments, bool deforms) const;
+  Deformable deformable_of(const int64_t* arguments, int64_t dim, int64_t heads) const;
   void fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const;
   void check_memory();
 

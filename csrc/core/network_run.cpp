@@ -10,6 +10,7 @@
 #include "dispatch.h"
 #include "network.h"
 #include "parallel.h"
+#include "sampling.h"
 #include "to_image.h"
 
 namespace darswin {
@@ -81,7 +82,9 @@ struct Network::Run {
 
   // Consecutive blocks of one map, part by part of the batch.
   void blocks(const Step* begin, const Step* end, void* scratch) const {
-    const int64_t slot = begin->arguments[0], most = part(*begin);
+    const int64_t slot = begin->arguments[0];
+    int64_t most = batch;
+    for (const Step* step = begin; step != end; ++step) most = std::min(most, part(*step));
     const int64_t parts = units(batch, most);
     for (int64_t k = 0; k < parts; ++k) {
       const int64_t first = batch * k / parts, count = batch * (k + 1) / parts - first;
@@ -95,7 +98,7 @@ struct Network::Run {
   int64_t part(const Step& step) const {
     const auto& block = step.block;
     const int64_t tokens = block.windows.rings * block.windows.sectors;
-    const int64_t widest = std::max(block.qkv.columns, block.fc1.columns);
+    const int64_t widest = std::max(block.attention_width(), block.fc1.columns);
     const int64_t bytes = tokens * widest * static_cast<int64_t>(sizeof(float));
     return std::clamp<int64_t>(kPartBytes / bytes, 1, batch);
   }
@@ -104,7 +107,7 @@ struct Network::Run {
     if (step.opcode == Opcode::linear && step.norm.dim > 0) {
       return batch * a[2] * a[3] * static_cast<int64_t>(sizeof(float)) + kSpare;
     }
-    return step.opcode == Opcode::block ? step.block.scratch(part(step) * a[1] * a[2]) : 0;
+    return step.is_block() ? step.block.scratch(part(step) * a[1] * a[2]) : 0;
   }
 
   void copy(const int64_t* a) const {
@@ -266,30 +269,11 @@ struct Network::Run {
 
   void sample(const int64_t* a) const {
     const int64_t height = a[2], width = a[3], rows = a[4], columns = a[5], channels = a[6];
-    const auto& kernel = kernels<ElementKernels>();
     rows_of_pixels(rows, columns * channels * 4, [&](int64_t b, int64_t y) {
       const float *x = image(a[0], b), *points = image(a[7], b) + y * columns * 2;
       float* out = result(a[1], b) + y * columns * channels;
       for (int64_t k = 0; k < columns; ++k, out += channels, points += 2) {
-        // NaN is outside too.
-        if (!(points[0] > -1 && points[0] < width && points[1] > -1 && points[1] < height)) {
-          std::fill_n(out, channels, 0.0f);
-          continue;
-        }
-        const float left = std::floor(points[0]), top = std::floor(points[1]);
-        const float right_part = points[0] - left, lower_part = points[1] - top;
-        const auto column = static_cast<int64_t>(left), row = static_cast<int64_t>(top);
-        const float* corners[4];
-        float parts[4];
-        for (int64_t corner = 0; corner < 4; ++corner) {
-          const int64_t i = row + corner / 2, j = column + corner % 2;
-          const bool inside = i >= 0 && i < height && j >= 0 && j < width;
-          corners[corner] = x + (inside ? (i * width + j) * channels : 0);
-          parts[corner] = inside ? (corner / 2 == 1 ? lower_part : 1 - lower_part) *
-                                       (corner % 2 == 1 ? right_part : 1 - right_part)
-                                 : 0;
-        }
-        kernel.mix(corners, parts, out, channels);
+        sample_at(x, height, width, channels, points[0], points[1], out, channels);
       }
     });
   }
@@ -322,6 +306,7 @@ struct Network::Run {
       case Opcode::norm:
         return normalize(all(a[0]), batch * a[2], step.norm, to[a[1]]);
       case Opcode::block:
+      case Opcode::deform:
         return blocks(&step, &step + 1, scratch);
       case Opcode::copy:
         return copy(a);
@@ -384,8 +369,8 @@ void Network::run(int64_t batch, const Input* given, float* const* results) cons
   }
   for (size_t k = 0; k < steps.size();) {
     size_t end = k + 1;
-    if (steps[k].opcode == Opcode::block) {
-      while (end < steps.size() && steps[end].opcode == Opcode::block &&
+    if (steps[k].is_block()) {
+      while (end < steps.size() && steps[end].is_block() &&
              steps[end].arguments[0] == steps[k].arguments[0]) {
         ++end;
       }

@@ -33,8 +33,8 @@ def in_picture(
     remap: Remap, found: Sequence[Detections], floor: Mapping[str, Any] | None = None
 ) -> Found:
     """The detections in a view, or in all tiles, as columns of things in the picture, the best
-    first: boxes, visible, scores and labels; and keypoints, turned and masks if there are any, and
-    places on the floor by the arguments of `Remap.floor`.
+    first: boxes, visible, scores and labels; keypoints, turned and masks if there are any; and
+    their places on the floor, if the arguments of `Remap.floor` are given.
 
     Things come by the ellipses in their boxes, turned or not; keypoints as points; and masks by
     their pixels. What the picture does not show is left out, and keypoints of it are NaN.
@@ -149,8 +149,8 @@ def entries(found: Found, columns: Mapping[str, Sequence[Any]]) -> list[dict[str
         key: rounded(found[key], digits)
         for key, digits in (("keypoints", 3), ("turned", 4)) if key in found
     }  # fmt: skip
-    more |= {"mask": found["masks"]} if "masks" in found else {}
     if "floor" in found:
         more["floor"] = [None if None in place else place for place in rounded(found["floor"], 3)]
+    more |= {"mask": found["masks"]} if "masks" in found else {}
     columns = {**columns, **more}
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

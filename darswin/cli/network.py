@@ -116,8 +116,8 @@ class NetworkAnswers(Answers):
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
         top: int | None = None, task: Any = None, scores: Any = None,
-        format: Literal["json", "coco", "yolo"] | None = None, height: float | None = None,
-        radius: float | None = None,
+        height: float | None = None, radius: float | None = None,
+        format: Literal["json", "coco", "yolo"] | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
         check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")

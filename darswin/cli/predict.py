@@ -52,8 +52,8 @@ def predict(
     std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
     threshold: float | None = None, labels: str | None = None,
     scores: Literal["softmax", "sigmoid"] | None = None,
-    format: Literal["json", "coco", "yolo"] | None = None, height: float | None = None,
-    radius: float | None = None,
+    height: float | None = None, radius: float | None = None,
+    format: Literal["json", "coco", "yolo"] | None = None,
 ) -> list[dict]:  # fmt: skip
     """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
     or runs any network in an ONNX file, such as a detector, on a view of them.
@@ -129,7 +129,7 @@ def predict(
     options: dict[str, Any] = {
         "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
         "channels": channels, "threshold": threshold, "labels": labels, "scores": scores,
-        "format": format, "height": height, "radius": radius,
+        "height": height, "radius": radius, "format": format,
     }  # fmt: skip
     if network is None and (given := [k for k, value in options.items() if value is not None]):
         raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")

@@ -16,7 +16,6 @@ from darswin.frames.tensor_file import check_name, write_tensors
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.encoder import FeatureMaps
 from darswin.ops.checks import check_pair, per_channel
 from darswin.views import PixelView, PolarView, View
 from darswin.views.base import Pair, check_lens
@@ -77,8 +76,9 @@ def export_network(
     lens. It also runs in C and C++ programs, by the library libdarswin_frames.so.
 
     Args:
-        model: a classifier, a backbone or a Unet of `create_model` with float32 weights in eval
-            mode. If it is quantized (see `quantize_model`), the network computes with 8 bits.
+        model: a model of `create_model`, or a `LensAdapter` of one whose view is one picture, with
+            float32 weights in eval mode. If it is quantized (see `quantize_model`), the network
+            computes with 8 bits.
         lens: the lens of the camera; None if the model ignores its lens.
         size: (H, W) of the frames.
         path: of the file; its name ends in ".safetensors".
@@ -120,12 +120,9 @@ def export_network(
             program = frame_program(fast, lens, size)
     except NoProgramError as error:
         raise TypeError(
-            f"model must be a classifier, a backbone or a Unet that a file can contain, got "
-            f"{type(model).__name__}: {error}"
+            f"model must be one that a file can contain, got {type(model).__name__}: {error}"
         ) from error
     constants = [np.zeros(0, np.float32), *(one.numpy().ravel() for one in program.constants)]
-    is_list = isinstance(model, FeatureMaps)
-    finish = "probabilities" if program.is_classifier else "list" if is_list else "array"
     write_tensors(
         path,
         {"reads_frame": np.array(program.reads_frame, np.int64)}
@@ -135,7 +132,7 @@ def export_network(
             constants=np.concatenate(constants),
             weights=program.weights.numpy(),
         ),
-        {"darswin_network": _VERSION, "plan.output": places.output, "finish": finish}
+        {"darswin_network": _VERSION, "plan.output": places.output, "finish": program.finish}
         | {f"label.{k}": name for k, name in enumerate(names)},
     )
 

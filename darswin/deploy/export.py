@@ -145,22 +145,24 @@ def _program(
     sampled, size = input == "tokens", None
     if sampled and not isinstance(model, Model):
         raise TypeError(f'input="tokens" needs a model of darswin, got {type(model).__name__}')
-    pixels = {"images": images}
+    pixels, batch = {"images": images}, torch.export.Dim("batch")
     with torch.no_grad(), Progress("tracing the model"):
         if isinstance(model, Model):
             height, width = model._with_shape(images).shape[2:]
             size = height, width
             if sampled:
                 pixels = _sampled(model, images, lens, size)
+        rows = {key: {0: batch} for key in (*pixels, *tensors)}
+        if sampled and isinstance(model, Model) and model.view.count > 1:
+            rows["tokens"] = {0: model.view.count * batch}  # all pictures of an image, in turn
         module = _OfTensors(
             model, lens, size, pixels, tensors, sampled=sampled, any_strides=any_strides
         )
-        batch = {0: torch.export.Dim("batch")}
         program = torch.export.export(
             module,
             tuple(pixels.values()),
             tensors,
-            dynamic_shapes=dict.fromkeys((*pixels, *tensors), batch),
+            dynamic_shapes=rows,
             strict=False,  # it takes half of the time of a strict export
         )
         for graph in program.graph_module.modules():  # its own, and those of its loops

@@ -65,35 +65,35 @@ def _(norm: nn.LayerNorm, libraries: Libraries) -> nn.Module:
     return FastLayer(libraries.of(norm).norm(norm))
 
 
-@fast.register(PatchProjection)
-@fast.register(nn.Conv2d)
-def _(layer: nn.Module, libraries: Libraries) -> nn.Module:
-    return InDtype(layer, libraries.dtype)
+@fast.register
+def _(conv: nn.Conv2d, libraries: Libraries) -> nn.Module:
+    return InDtype(conv, libraries.dtype)
 
 
 @fast.register
-def _(embed: PatchEmbed, libraries: Libraries) -> nn.Module:
+def _(layer: PatchProjection, libraries: Libraries) -> nn.Module:
     own = libraries.dtype == torch.float32
-    return FastPatchEmbed(embed) if own else InDtype(embed, libraries.dtype)
+    return FastProjection(layer) if own else InDtype(layer, libraries.dtype)
 
 
-class FastPatchEmbed(nn.Module):
-    """The embedding of square patches, as a product of our own."""
+class FastProjection(nn.Module):
+    """The joining of neighbours of a map, or of pixels, as a product of our own."""
 
-    def __init__(self, embed: PatchEmbed):
+    def __init__(self, layer: PatchProjection):
         super().__init__()
-        conv = embed.proj
+        conv, self.of_images = layer.proj, isinstance(layer, PatchEmbed)
         self.patch = conv.kernel_size[0]
-        self.proj = OwnLinear(pack(conv.weight.flatten(1), conv.bias), conv.out_channels)
-        self.norm = OwnNorm(embed.norm)
+        rows = conv.weight.permute(0, 2, 3, 1).flatten(1)
+        self.proj = OwnLinear(pack(rows, conv.bias), conv.out_channels)
+        self.norm = OwnNorm(layer.norm)
 
     def forward(self, x: Tensor) -> Tensor:
         refuse_gradients(x)
-        batch, channels, height, width = x.shape
+        x = x.float().permute(0, 2, 3, 1) if self.of_images else x.float()
+        batch, height, width, channels = x.shape
         side, rows, columns = self.patch, height // self.patch, width // self.patch
-        x = x.float().reshape(batch, channels, rows, side, columns, side)
-        x = x.permute(0, 2, 4, 1, 3, 5).reshape(batch, rows, columns, channels * side * side)
-        return self.norm(self.proj(x))
+        x = x.reshape(batch, rows, side, columns, side, channels).transpose(2, 3)
+        return self.norm(self.proj(x.flatten(3)))
 
 
 @fast.register

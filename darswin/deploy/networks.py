@@ -12,6 +12,7 @@ from darswin.deploy.packed import refuse_gradients
 from darswin.deploy.program import Checked, NoProgramError, Weights
 from darswin.deploy.record import Trace, inverse, traced
 from darswin.lens import Equidistant
+from darswin.models.adapter import adapted
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.prepared import Prepared
@@ -59,7 +60,7 @@ class Programs:
         self._model, self._forward, self._weights = model, layers.forward_network, weights
         self._known: dict[Any, _Known] = {}
         self._bound: dict[int, _Bound] = {}
-        size = model.image_size or tuple(model.pretrained_cfg["input_size"][1:])
+        size = model.image_size or tuple(adapted(model).pretrained_cfg["input_size"][1:])
         shapes = [of for of in (seen_by(model, size), _images(model, size)) if of is not None]
         with torch.no_grad():
             self._bind(_prepared_for_some_lens(model, layers, size), tuple(shapes))
@@ -137,7 +138,7 @@ class FrameProgram(NamedTuple):
     weights: Tensor  # (K,) int32
     constants: list[Tensor]  # float32, without the batch: all inputs but the sampled ones
     reads_frame: bool  # input 1 is the frame itself, (H, W, C) and normalized
-    is_classifier: bool  # the output is logits of classes
+    finish: str  # "probabilities" of the logits, a "list" of maps, or an "array"
 
 
 def frame_program(model: Any, lens: Any, size: Pair) -> FrameProgram:
@@ -148,6 +149,8 @@ def frame_program(model: Any, lens: Any, size: Pair) -> FrameProgram:
     Raises:
         NoProgramError: the model has a part that is no instruction of a program.
     """
+    if model.view.count != 1:
+        raise NoProgramError(f"its view shows {model.view.count} pictures of each image")
     layers, weights = model.layers, model.weights
     prepared = _read(layers.prepare(lens, size))
     images = _images(model, size)
@@ -157,8 +160,9 @@ def frame_program(model: Any, lens: Any, size: Pair) -> FrameProgram:
     )  # fmt: skip
     words = trace.program.words()
     constants = [one.detach().float()[0].contiguous() for one in trace.given]
-    classifies = isinstance(model, Encoder) and model.num_classes > 0
-    return FrameProgram(words, weights.words, constants, images is not None, classifies)
+    classifies = isinstance(adapted(model), Encoder) and model.num_classes > 0
+    finish = "probabilities" if classifies else "list" if trace.is_list else "array"
+    return FrameProgram(words, weights.words, constants, images is not None, finish)
 
 
 def _images(model: Model, size: Pair) -> tuple[int, ...] | None:

@@ -20,6 +20,7 @@ from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
+from darswin.models.adapter import adapted
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.pixel import PixelModel
@@ -47,7 +48,7 @@ def optimize(
     and it has no gradients. The model itself stays as it is.
 
     Args:
-        model: a model of `create_model`, on the CPU.
+        model: a model of `create_model`, or a `LensAdapter` of one, on the CPU.
         dtype: torch.float32, torch.bfloat16 or torch.int8. With bfloat16, the maps between the
             layers and the result are bfloat16; distances stay float32. With int8, the products of a
             quantized model (see `quantize_model`) are computed with 8 bits, and the rest with
@@ -99,8 +100,8 @@ def optimized(
         if isinstance(part, Model):  # an encoder may be part of another model
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
-            vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
-    vars(made).update(weights=libraries.weights)
+            vars(part).update(dtype=model.dtype)
+    vars(made).update(fixed_lens=lens, known={}, weights=libraries.weights)
     lack = "oneDNN, whose products are faster here" if by_onednn else ""
     if not lack:
         try:
@@ -124,8 +125,11 @@ def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:
 
 def check_model(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     """TypeError or ValueError for what `optimize` does not take."""
-    if not isinstance(model, (Encoder, PixelModel, FeatureMaps)):
-        raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
+    if not isinstance(network := adapted(model), (Encoder, PixelModel, FeatureMaps)):
+        raise TypeError(
+            "model must be a model of create_model, or a LensAdapter of one, "
+            f"got {type(network).__name__}"
+        )
     if isinstance(model, Optimized):
         raise TypeError("model must be a model of create_model, got an optimized model")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
@@ -171,7 +175,7 @@ class Optimized(Model[Any]):
         return self.known[size]
 
     def _check_device(self, name: str, images: Tensor) -> None:
-        if not images.is_cpu:
+        if images.device.type != "cpu":
             raise ValueError(f"{name} must be on the CPU, as the model is, got {images.device}")
 
     def extra_repr(self) -> str:

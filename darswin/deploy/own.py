@@ -11,6 +11,7 @@ from torch.overrides import handle_torch_function, has_torch_function_unary
 
 import darswin.ops  # noqa: F401  (it registers our operators)
 from darswin.layers.quantized import Quantization, quantized_layers
+from darswin.models.dat import DeformableAttention
 from darswin.ops import _module
 
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -86,15 +87,32 @@ class OwnNorm:
         return _NORM(x, self.parameters, self.eps)
 
 
+class PackedDeformable:
+    """What deformable attention has besides the parts of a block, packed.
+
+    Attributes:
+        around: the convolution for the channels of all groups, channels last, then its bias.
+    """
+
+    def __init__(self, attn: DeformableAttention):
+        self.groups, self.kernel = attn.groups, attn.around.kernel_size[0]
+        self.reach = attn.offset_range
+        bias: Any = attn.around.bias
+        taps = [*attn.around.weight.flatten(1).t(), bias]
+        self.around = torch.cat([tap.repeat(attn.groups) for tap in taps]).detach().float()
+        self.norm = OwnNorm(attn.norm)
+        self.offset, self.kv = packed_weights(attn.offset), packed_weights(attn.kv)
+
+
 class PackedBlocks:
-    """The blocks of a stage, packed. All of them have window attention."""
+    """The blocks of a stage, packed. All of them have window attention or deformable attention."""
 
     def __init__(self, blocks: Sequence[Any]):
-        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
+        # Of each block: norm1, qkv (in deformable attention q alone), proj, norm2, fc1 and fc2.
         self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
             (
                 OwnNorm(block.norm1),
-                packed_weights(block.attn.qkv),
+                packed_weights(block.attn.q if _deforms(block) else block.attn.qkv),
                 packed_weights(block.attn.proj),
                 OwnNorm(block.norm2),
                 packed_weights(block.mlp.fc1),
@@ -102,9 +120,15 @@ class PackedBlocks:
             )
             for block in blocks
         ]
+        self.deformable = [
+            PackedDeformable(block.attn) if _deforms(block) else None for block in blocks
+        ]
         # Of each block: the window, the shift, and whether an axis is periodic.
         self.windows: list[list[int]] = [
-            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
+            [*block.attn.map_size, 0, 0, 0, 0]
+            if _deforms(block)
+            else [*block.attn.window, *block.attn.shift, *block.attn.periodic]
+            for block in blocks
         ]
         attn = blocks[0].attn
         self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
@@ -114,3 +138,7 @@ class PackedBlocks:
     def table_shapes(self) -> list[tuple[int, int, int]]:
         """The shape of the position bias of each block."""
         return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]
+
+
+def _deforms(block: Any) -> bool:
+    return isinstance(block.attn, DeformableAttention)

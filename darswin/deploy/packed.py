@@ -32,6 +32,7 @@ from darswin.layers.quantized import (
     quantize,
     quantized_layers,
 )
+from darswin.models.dat import DeformableAttention
 
 Key = TypeVar("Key")
 Layer = Callable[[Tensor], Tensor]
@@ -56,19 +57,11 @@ class OwnBlocks(PackedBlocks):
 
     def __init__(self, blocks: Sequence[Any], weights: Weights):
         super().__init__(blocks)
-        self.weights = weights
-        for of_block in self.layers:
-            for layer in of_block:
-                weights.offset(layer.words if isinstance(layer, OwnNorm) else layer)
-
-    @cached_property
-    def written(self) -> Program:
-        """The program of these blocks alone: a map and the position biases → the map."""
-        program = Program(self.weights)
-        x = program.input(*self.map_shape)
-        tables = [program.input(*shape) for shape in self.table_shapes]
-        program.output(program.blocks(x, self, tables))
-        return program
+        # The program of these blocks alone: a map and the position biases → the map.
+        self.written = Program(weights)
+        x = self.written.input(*self.map_shape)
+        tables = [self.written.input(*shape) for shape in self.table_shapes]
+        self.written.output(self.written.blocks(x, self, tables))
 
     @cached_property
     def program(self) -> Checked:
@@ -100,8 +93,9 @@ class Own:
         return OwnNorm(norm)
 
     def blocks(self, blocks: Sequence[Any]) -> Blocks:
-        """The blocks of a stage: one operator, if all of them have window attention."""
-        if not blocks or not all(_has_windows(block.attn) for block in blocks):
+        """The blocks of a stage: one operator, if all have window or deformable attention."""
+        own = WindowAttention, DeformableAttention
+        if not blocks or not all(isinstance(block.attn, own) for block in blocks):
             return OneDNN(torch.float32, self.weights).blocks(blocks)
         return OwnBlocks(blocks, self.weights)
 
@@ -195,7 +189,7 @@ class OneDNN(Own):
 
     def _attention(self, attn: Any) -> Callable[[Tensor, Tensor], Tensor]:
         """Window attention without its checks, which cannot fail here; other kinds by torch."""
-        if not _has_windows(attn):
+        if not isinstance(attn, WindowAttention):
             return InDtype(attn, self.dtype)
         qkv, proj = self.linear(attn.qkv), self.linear(attn.proj)
         sizes = (3, attn.num_heads, attn.dim // attn.num_heads)
@@ -226,10 +220,6 @@ class Libraries:
             not quantized_layers(layer) or self._own_alone or has_own_int8()
         )
         return Own(self.weights) if own else OneDNN(self.dtype, self.weights)
-
-
-def _has_windows(attn: nn.Module) -> bool:
-    return isinstance(attn, WindowAttention)
 
 
 def _product(linear: Any, dtype: torch.dtype, gelu: bool) -> Layer:

@@ -55,7 +55,10 @@ class Recorded(Tensor):
             raise NoProgramError(f"{resolve_name(function)} is no instruction")
         with torch._C.DisableTorchFunctionSubclass():
             plain = (v.meta if isinstance(v, Recorded) else v for v in arguments)
-            result = function(*plain, **named)
+            try:
+                result = function(*plain, **named)
+            except RuntimeError as error:  # such as a shape that depends on the number of pictures
+                raise NoProgramError(f"{resolve_name(function)} is no instruction") from error
         results = result if isinstance(result, (tuple, list)) else (result,)
         if not any(isinstance(one, Tensor) for one in results):
             return result  # a size, a dtype

@@ -19,6 +19,7 @@ from darswin.lens.polynomial import horner, slopes
 from darswin.lens.solve import (
     determinant,
     direction_of,
+    gradient_steps,
     length_of,
     newton,
     radial_slopes,
@@ -138,21 +139,17 @@ class DistortedLens(FocalLens, register=False):
         )
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
-    def _distort(self, point: Tensor) -> Tensor:
-        """(..., 2): the image of a point w (cos φ, sin φ) of the ideal plane, in focal lengths."""
+    def _distort(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., 2) and (..., 2, 2): the image of a point w (cos φ, sin φ) of the ideal plane, in
+        focal lengths, and its derivatives."""
         w = length_of(point)
-        direction, stretched = point / w[..., None], self._stretch(w)
-        plane = stretched if self.aside_last else w
-        return stretched[..., None] * direction + self._aside(plane[..., None] * direction)
-
-    def _distort_slopes(self, point: Tensor) -> Tensor:
-        """(..., 2, 2): the derivatives of `_distort`."""
-        w = length_of(point)
-        direction, stretched = point / w[..., None], self._stretch(w)
-        straight = radial_slopes(stretched / w, self._stretch_slope(w), direction)
+        ratio = self._stretch(w) / w
+        direction, stretched = point / w[..., None], ratio[..., None] * point
+        straight = radial_slopes(ratio, self._stretch_slope(w), direction)
         if self.aside_last:
-            return straight + self._aside_slopes(stretched[..., None] * direction) @ straight
-        return straight + self._aside_slopes(w[..., None] * direction)
+            slope = straight + self._aside_slopes(stretched) @ straight
+            return stretched + self._aside(stretched), slope
+        return stretched + self._aside(point), straight + self._aside_slopes(point)
 
     def _least_area(self, theta: Tensor) -> Tensor:
         """(N, K): the factor by which the distortion enlarges an area at θ, at its smallest over φ.
@@ -160,7 +157,7 @@ class DistortedLens(FocalLens, register=False):
         The factor is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine it.
         """
         points = self._plane(theta)[..., None, None] * _circle(8, theta)
-        area = determinant(self._distort_slopes(points))
+        area = determinant(self._distort(points)[1])
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
         # The minimum of the parabola through the smallest sample and its neighbours.
@@ -177,9 +174,8 @@ class DistortedLens(FocalLens, register=False):
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
         """(N, ..., 2): points of the ideal plane that `_distort` maps to `goal`, if there are any
         within `last`. The search begins at half of `start`, far from any fold."""
-        maps = self._distort, self._distort_slopes
         if not readable(goal):  # no shape depends on values
-            return newton(*maps, goal, start / 2, 1.1 * last, rounds=30)
+            return newton(self._distort, goal, start / 2, 1.1 * last, rounds=30)
         circle = _circle(256, goal)
         # One lens at a time: each selects another number of pixels.
         shape, start = goal.shape, self._by_lens(start.expand_as(goal)).unflatten(1, (-1, 2))
@@ -188,11 +184,11 @@ class DistortedLens(FocalLens, register=False):
             lens = self[k]
             # Most pixels without a ray lie beyond the rim; they are skipped. A rim that overflows
             # is NaN and beyond all pixels.
-            near = ~(length_of(goal[k]) >= 1.01 * length_of(lens._distort(end * circle)).max())
+            near = ~(length_of(goal[k]) >= 1.01 * length_of(lens._distort(end * circle)[0]).max())
             for share in (0.5, 0.0):  # the second time from the axis, as a fold may block the way
-                maps = lens._distort, lens._distort_slopes
-                points[k][near] = newton(*maps, goal[k][near], share * start[k][near], 1.1 * end)
-                near &= length_of(lens._distort(points[k]) - goal[k]) > self._slack(goal[k])
+                begin = share * start[k][near]
+                points[k][near] = newton(lens._distort, goal[k][near], begin, 1.1 * end)
+                near &= length_of(lens._distort(points[k])[0] - goal[k]) > self._slack(goal[k])
         return points.reshape(shape)
 
     def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:
@@ -213,13 +209,14 @@ class DistortedLens(FocalLens, register=False):
             last = self._plane(end)
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
             point = self._find_points(goal, start, last)
-            lands = length_of(self._distort(point) - goal) < self._slack(goal)
+            lands = length_of(self._distort(point)[0] - goal) < self._slack(goal)
             # Near a fold of the map, rounding a pixel by ε moves its ray by √ε.
             lands &= length_of(point) <= last * (1 + math.sqrt(torch.finfo(flat.dtype).eps))
         # Pixels without a ray become the principal point: NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
-        for _ in range(2):
-            point = point - solve(self._distort_slopes(point), self._distort(point) - goal)
+        for _ in range(gradient_steps()):
+            image, slope = self._distort(point)
+            point = point - solve(slope, image - goal)
         w = length_of(point)
         theta = torch.where(lands, self._plane_angle(w), torch.nan)
         return theta, torch.where(lands[..., None], point / w[..., None], direction)

@@ -47,9 +47,14 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
         rounds = min(_STEPS, 1 - round(math.log2(eps)))  # more halvings change nothing
         start = low, high, x, high - low
         _, _, x, _ = repeated(nearer, lambda *state: state[-1] > near, start, rounds)
-    for _ in range(2):
+    for _ in range(gradient_steps()):
         x = x - (function(x) - value) / slope(x)
     return x
+
+
+def gradient_steps() -> int:
+    """The number of Newton steps after the search, which carry the gradients; a graph has none."""
+    return 0 if torch.compiler.is_exporting() else 2
 
 
 def repeated(
@@ -122,22 +127,24 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
 
 
 def newton(
-    function: Function, slopes: Function, goal: Tensor, point: Tensor, end: Tensor, rounds: int = 60
-) -> Tensor:
+    function: Callable[[Tensor], tuple[Tensor, Tensor]], goal: Tensor, point: Tensor, end: Tensor,
+    rounds: int = 60,
+) -> Tensor:  # fmt: skip
     """The points that a map of the plane takes to `goal`.
 
     Each Newton step is shortened until it comes nearer to the goal, at a point where the map keeps
     its orientation. From a start with that orientation, the steps end at the goal or at a fold.
 
     Args:
-        function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
+        function: (..., 2) → (..., 2) and (..., 2, 2), its derivatives.
         goal, point: (n, 2), or any shape if it is not `readable`.
         end: the largest distance from the origin.
     """
 
     def nearer(goal: Tensor, point: Tensor, step: Tensor, missed: Tensor, part: Tensor) -> State:
         trial = point - part[..., None] * step
-        error, slope = function(trial) - goal, slopes(trial)
+        image, slope = function(trial)
+        error = image - goal
         better = (length_of(error) < missed) & (determinant(slope) > 0) & (length_of(trial) <= end)
         point = torch.where(better[..., None], trial, point)
         step = torch.where(better[..., None], solve(slope, error), step)
@@ -147,9 +154,9 @@ def newton(
     def going(goal: Tensor, missed: Tensor, part: Tensor) -> Tensor:
         return (missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))) & (part > 1e-6)
 
-    error = function(point) - goal
-    missed = length_of(error)
-    state: State = point, solve(slopes(point), error), missed, torch.ones_like(missed)
+    image, slope = function(point)
+    missed = length_of(image - goal)
+    state: State = point, solve(slope, image - goal), missed, torch.ones_like(missed)
     if not readable(point):  # no shape depends on values
         return repeated(
             partial(nearer, goal), lambda *state: going(goal, *state[2:]), state, rounds

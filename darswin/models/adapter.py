@@ -61,7 +61,7 @@ class LensAdapter(Model[Any]):
     """
 
     stages = ()
-    in_chans: None = None
+    in_chans: int | None = None
 
     def __init__(
         self,
@@ -85,6 +85,8 @@ class LensAdapter(Model[Any]):
         self.view = view
         self.network, self.output, self.boxes = network, output, boxes
         self.goes_back = output == "pixels"
+        if isinstance(network, Model):
+            self.in_chans, self.num_classes = network.in_chans, network.num_classes
         if self.mean is None:
             self._looks = 0  # the network may expect any values
 
@@ -132,3 +134,8 @@ class LensAdapter(Model[Any]):
 
     def extra_repr(self) -> str:
         return f"output={self.output!r}"
+
+
+def adapted(model: Any) -> Any:
+    """The network of an adapter; another model itself."""
+    return model.network if isinstance(model, LensAdapter) else model

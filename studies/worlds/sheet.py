@@ -25,7 +25,7 @@ PLACES = (
     ("freedoom1-E1M1", 1),
     ("freedoom1-E3M4", 1),
 )
-FRONT = Path(__file__).parents[2] / "examples" / "front.json"
+FRONT = Path(__file__).parents[2] / "examples" / "room.json"
 LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "a fisheye of 190°": str(FRONT)}
 
 

@@ -49,7 +49,7 @@ def test_large_batches_go_in_parts(monkeypatch, lenses):
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("name", "lenses"),
-    [*itertools.product(["darswin_a_nano", "swin_nano perspective"], [1, 200]),
+    [*itertools.product(["darswin_a_nano", "swin_nano perspective", "dat_nano"], [1, 200]),
      *(pytest.param("darswin_unet_a_nano", n, marks=pytest.mark.slow) for n in (1, 200))],
 )  # fmt: skip
 def test_large_batches_have_the_bits_of_small_ones(name, lenses):
@@ -142,8 +142,8 @@ def test_without_onednn_it_warns_and_goes_on(monkeypatch):
 def test_what_cannot_be_optimized():
     model = network("darswin_a_nano")
     for wrong, options, kind, message in (
-        (torch.nn.Linear(2, 2), {}, TypeError, "model of create_model, got Linear"),
-        ("model", dict(dtype="fastest"), TypeError, "model of create_model, got str"),
+        (torch.nn.Linear(2, 2), {}, TypeError, "a LensAdapter of one, got Linear"),
+        ("model", dict(dtype="fastest"), TypeError, "a LensAdapter of one, got str"),
         (optimize(model), {}, TypeError, "got an optimized model"),
         (model, dict(dtype=torch.float16), ValueError, "got torch.float16"),
         (model, dict(lens=LENSES), ValueError, "lens must be one lens"),

@@ -230,7 +230,7 @@ def test_fastest(monkeypatch):
 @pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
 def test_the_largest_sums_do_not_overflow(name):
     """CPUs without VNNI may add the products of two bytes in 16 bits, where 2 · 255 · 127 is too
-    large. The blocks of DAT have no windows: they are computed layer by layer."""
+    large."""
     model, (images, lens) = network(name), batch()
     for layer in model.modules():
         if isinstance(layer, Mlp):

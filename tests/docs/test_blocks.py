@@ -259,7 +259,7 @@ def test_a_detector_finds_the_same_with_torch_and_without_and_by_the_command(scr
     np.testing.assert_allclose(alone, with_torch, atol=1.5)
     np.testing.assert_allclose(by_command, alone, atol=0.02)
     drawn = [cv2.imread(name) for name in ("found.jpg", "without_torch.jpg")]
-    assert all(np.abs(one - cv2.imread("examples/front.jpg")).max() > 100 for one in drawn)
+    assert all(np.abs(one - cv2.imread("examples/room.jpg")).max() > 100 for one in drawn)
 
 
 @pytest.mark.slow
