@@ -397,3 +397,15 @@ def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
     for value, kind in ((seven, "numbers"), (pooled, "maps")):
         path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
         assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
+
+
+def test_boxes_of_cells_are_corners_with_probabilities(tmp_path):
+    """As of YOLO-NAS. Middles and sizes, or logits, are refused."""
+    cells = priors(8, 16, 32)
+    middles = np.column_stack(((cells[:, :2] + 0.5) * cells[:, 2:], cells[:, 2], cells[:, 2]))
+    scores = np.full((len(cells), 9), 0.1)
+    for boxes, given in ((middles, scores), (np.abs(middles).cumsum(1), scores - 2)):
+        outputs = dict(a=boxes[None].astype(np.float32), b=given[None].astype(np.float32))
+        path = write_detector(tmp_path / "n.onnx", SIZE, outputs)
+        with pytest.raises(ValueError, match=r"outputs a .*, b .*; known are the forms"):
+            OnnxNetwork(path)

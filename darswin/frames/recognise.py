@@ -145,7 +145,10 @@ def _pair(outputs: Outputs, size: Size) -> Form | None:
     if width == 5 or flat[other][:-1] != (*things,):
         return None
     if things[1] in grids(size):
-        return Form("YOLO-NAS", where, overlaps=True)
+        corners, scores = outputs[boxes], outputs[other]
+        share = (corners[..., :2] <= corners[..., 2:]).all(-1).mean()
+        are_read = share > 0.9 and scores.min() >= 0 and scores.max() <= 1
+        return Form("YOLO-NAS", where, overlaps=True) if are_read else None
     if boxes == "dets":
         return Form("RF-DETR", where, "middle", True, "sigmoid", pixels=_IMAGENET)
     return Form("transformers", where, "middle", True, "?")
