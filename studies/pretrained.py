@@ -41,7 +41,6 @@ from pretrained_tables import PAIRS, SLICED_PAIRS, publish
 # The numbers of the scenes: the first one, and how many. Earlier ones chose the layouts of tiles.
 SCENES = {"level": (48, 96), "small": (0, 24), "down": (24, 48), "perspective": (0, 12)}
 SECOND = 24  # scenes for the second network
-SLICED_SCENES = {"level": 48, "small": 24, "down": 24}  # the first ones, for slices
 PEOPLE = 12  # pictures of the video
 FLAT = ("level", "down")  # splits with flat pictures of each thing
 REPEATS = 7  # of a time
@@ -51,11 +50,6 @@ def chosen(counts: dict[str, tuple[int, int]], network: str, split: str) -> list
     """The numbers of the scenes of a table."""
     first, count = counts[split]
     return list(range(first, first + (min(count, SECOND) if network != "CenterNet" else count)))
-
-
-def sliced(numbers: list[int], split: str) -> list[int]:
-    """The numbers of the scenes whose pictures are sliced."""
-    return numbers[: SLICED_SCENES[split]]
 
 
 def lenses_of(split: str) -> tuple[str, ...]:
@@ -75,6 +69,8 @@ def look(split: str, lens: str, chosen_of: dict[str, list[int]], out: Path) -> d
     for network, numbers in chosen_of.items():
         detector = detector_of(out, network)
         methods = PEOPLE_METHODS if split == "people" else STUDIED[network, split]
+        if network == "CenterNet":
+            methods = methods | SLICED.get(split, {})
         for method in methods.values():
             for index in sorted(indices & set(numbers)):
                 folder = pictures.folder(split, index)
@@ -82,10 +78,6 @@ def look(split: str, lens: str, chosen_of: dict[str, list[int]], out: Path) -> d
         if split in FLAT:
             for index in sorted(indices & set(numbers)):
                 pictures.flat(scenes[index], detector)
-    for method in SLICED.get(split, {}).values():
-        for index in sorted(indices & set(sliced(chosen_of["CenterNet"], split))):
-            folder, detector = pictures.folder(split, index), detector_of(out, "CenterNet")
-            found_by(method, scenes[index], shown[index], detector, folder)
     return {}
 
 
@@ -101,7 +93,7 @@ def collect(out: Path, counts: dict[str, tuple[int, int]]) -> dict:
     tables["CenterNet, people"] = people
     slices = {}
     for split, methods in SLICED.items():
-        numbers = sliced(chosen(counts, "CenterNet", split), split)
+        numbers = chosen(counts, "CenterNet", split)
         made, of_pairs = table(out, "CenterNet", split, numbers, methods, pairs=SLICED_PAIRS)
         slices[split] = made | dict(pairs=of_pairs)
     pictures = Pictures(out)
