@@ -662,6 +662,36 @@ def test_turned_boxes_come_back(tmp_path, view, size, format):
             assert (names[label], round(score, 4)) == (given["label"], given["score"])
 
 
+def test_each_picture_has_an_id_of_its_own_in_coco(tmp_path):
+    """Their names are no ids if two have one number; and an old file is replaced by nothing."""
+    rows = np.array([[[10, 10, 30, 30, 0.5, 1]]], np.float32)
+    network = write_constants(tmp_path / "n.onnx", (64, 64), found=rows)
+    lens = {"model": "Equidistant", "focal": 24.0, "theta_max": 1.2}
+    for name in ("in/a/7.png", "in/b/8.png", "in/b/c.png", "more/b/07.png"):
+        write_picture(tmp_path / name, np.zeros((64, 80, 3), np.uint8))
+    write_frames(tmp_path / "in/v.mp4", np.zeros((2, 64, 80, 3), np.uint8), 10)
+    folders, frames = [tmp_path / "in", tmp_path / "more"], ["v.mp4/000000", "v.mp4/000001"]
+    names = [f"in/{name}" for name in ("a/7", "b/8", "b/c", *frames)]
+    for paths, threshold, ids in (
+        (folders[:1], "0.1", [7, 8, "b/c", *frames]),
+        (folders, "0.1", [*names, "more/b/07"]),
+        (folders, "0.9", []),
+    ):
+        argv = [*paths, "--network", network, "--format", "coco", "--threshold", threshold]
+        predict(*argv, out=tmp_path / "out", lens=lens)
+        results = json.loads((tmp_path / "out/coco.json").read_text())
+        assert [one["image_id"] for one in results] == ids
+
+
+def test_infinity_is_null_in_json(tmp_path):
+    points = np.array([[[[32, 32, np.inf], [np.inf, 32, 0.5]]]], np.float32)
+    (one,) = run_constants(
+        tmp_path, view="mercator", boxes=np.array([[[20, 20, 40, 40]]], np.float32),
+        scores=np.array([[0.9]], np.float32), labels=np.array([[1]]), keypoints=points,
+    )["detections"]  # fmt: skip
+    assert one["keypoints"][0][2] is None and one["keypoints"][1] == [None, None, 0.5]
+
+
 def test_boxes_that_overlap_are_merged_and_words_answer_questions(tmp_path, capsys):
     """Of YOLO without its metadata, in whose boxes each thing has several."""
     y, x = np.mgrid[:16, :16] * 8 + 4.0
