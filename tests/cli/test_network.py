@@ -352,6 +352,11 @@ def test_a_stream_ends_by_ctrl_c_with_its_predictions(tmp_path, monkeypatch, cap
         assert entry["overlay"] == f"overlays/rtsp_host_door/{entry['frame']:06}.jpg"
         assert (tmp_path / "out" / entry["overlay"]).is_file()
     assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
+    for given in (json.dumps(lens_of("Equidistant") | {"image_size": [9, 9]}), str(tmp_path)):
+        command = ["predict", *argv, "--lens", given, "--out", tmp_path / "out"]
+        with pytest.raises(SystemExit, match=r"for 9×9|no calibration in") as error:
+            main([str(word) for word in command])
+        assert "secret" not in str(error.value)
     assert "secret" not in capsys.readouterr().err
 
 
