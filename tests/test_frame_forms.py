@@ -364,6 +364,15 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         check_known(form, found)
 
 
+@pytest.mark.parametrize("last", [17.0, 1.0])
+def test_scores_of_1_are_no_classes(tmp_path, last):
+    """In tables with the number of the picture, whose class may stand before the score or after."""
+    row = [0, 10, 20, 30, 40, 18.0 - last, last]
+    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row], np.float32)})
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
+
+
 def test_words_that_do_not_fit_are_told(tmp_path):
     for form, words, said in (
         ("detect", {"task": "pose"}, "`task` must be detect, got pose"),

@@ -126,8 +126,9 @@ def yolo_lines(size: Size, found: Found) -> str:
         if "masks" in found:
             mask = boxes.decode_rle(found["masks"][k]).astype(np.uint8)
             outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-            if outlines:
-                row = (max(outlines, key=cv2.contourArea).reshape(-1, 2) + 0.5) / sides
+            outline = max(outlines, key=cv2.contourArea, default=np.zeros(0)).reshape(-1, 2)
+            if len(outline) > 2:  # or it would read as a box
+                row = (outline + 0.5) / sides
         numbers = [*row.ravel()]
         if "keypoints" in found:
             numbers += (_three(found["keypoints"][k]) / [*sides, 1]).ravel().tolist()

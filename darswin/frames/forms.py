@@ -123,7 +123,8 @@ def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: fl
         scores = (scores / scores.sum(-1, keepdims=True))[:, :-1]
     labels = found["labels"].reshape(things) if "labels" in found else scores.argmax(-1)
     score = scores.max(-1)
-    if "image" in found and (labels % 1).any():  # SuperGradients has the class after the score
+    # SuperGradients has the class after the score.
+    if "image" in found and ((labels % 1).any() or (score > 1).any()):
         labels, score = score, labels
     if form.scores == "sigmoid":
         score = 1 / (1 + np.exp(-score))

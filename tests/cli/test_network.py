@@ -15,7 +15,8 @@ pytest.importorskip("onnxruntime")
 
 from graphs import write_constants, write_detector, write_graph
 
-from darswin.boxes import decode_rle
+from darswin.boxes import decode_rle, encode_rle
+from darswin.cli.found import yolo_lines
 from darswin.cli.main import main
 from darswin.cli.network import NetworkAnswers
 from darswin.lens import Equidistant
@@ -686,6 +687,16 @@ def test_each_picture_has_an_id_of_its_own_in_coco(tmp_path):
         predict(*argv, out=tmp_path / "out", lens=lens)
         results = json.loads((tmp_path / "out/coco.json").read_text())
         assert [one["image_id"] for one in results] == ids
+
+
+def test_a_mask_of_few_pixels_is_a_box_in_yolo():
+    """Two points would read as a box."""
+    mask = np.zeros((10, 20), bool)
+    mask[4, 6:8] = True
+    found = dict(
+        boxes=np.array([[5.0, 4, 9, 6]]), scores=[0.5], labels=[3], masks=[encode_rle(mask)]
+    )
+    assert yolo_lines((10, 20), found) == "3 0.35 0.5 0.2 0.2 0.5\n"
 
 
 def test_infinity_is_null_in_json(tmp_path):
