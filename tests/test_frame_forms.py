@@ -373,6 +373,19 @@ def test_scores_of_1_are_no_classes(tmp_path, last):
     assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
 
 
+@pytest.mark.filterwarnings("error")
+def test_logits_may_be_very_low(tmp_path):
+    """They have a probability of 0, and masks of them show nothing."""
+    low = np.full((1, 2, 3), -1000.0, np.float32)
+    low[0, 0, 1] = 0
+    outputs = dict(dets=np.full((1, 2, 4), 0.5, np.float32), labels=low,
+                   masks=np.full((1, 2, HEIGHT // 4, WIDTH // 4), -1000.0, np.float32))  # fmt: skip
+    path = write_detector(tmp_path / "n.onnx", SIZE, outputs)
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([1], [0.5])
+    assert found.masks.shape[0] == 1 and not found.masks.any()
+
+
 def test_words_that_do_not_fit_are_told(tmp_path):
     for form, words, said in (
         ("detect", {"task": "pose"}, "`task` must be detect, got pose"),

@@ -115,6 +115,7 @@ def decode(
     return [_decoded(form, one, size, threshold) for one in each]
 
 
+@np.errstate(invalid="ignore", over="ignore")  # the caller tells of them
 def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: float) -> Detections:
     things, scores = len(found["boxes"]), found["scores"].astype(float)
     scores = scores[:, None] if scores.ndim == 1 else scores
