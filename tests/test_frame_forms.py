@@ -394,6 +394,7 @@ def test_words_that_do_not_fit_are_told(tmp_path):
             {"task": "boxes"},
             "`task` must be one of detect, pose, obb, segment, got boxes",
         ),
+        ("own", {"task": "pose"}, "`task` is pose, but the form '.*' has no keypoints"),
         ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
         ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
     ):
