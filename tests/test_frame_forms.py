@@ -364,6 +364,28 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         check_known(form, found)
 
 
+@pytest.mark.parametrize("last", [17.0, 1.0])
+def test_scores_of_1_are_no_classes(tmp_path, last):
+    """In tables with the number of the picture, whose class may stand before the score or after."""
+    row = [0, 10, 20, 30, 40, 18.0 - last, last]
+    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row], np.float32)})
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
+
+
+@pytest.mark.filterwarnings("error")
+def test_logits_may_be_very_low(tmp_path):
+    """They have a probability of 0, and masks of them show nothing."""
+    low = np.full((1, 2, 3), -1000.0, np.float32)
+    low[0, 0, 1] = 0
+    outputs = dict(dets=np.full((1, 2, 4), 0.5, np.float32), labels=low,
+                   masks=np.full((1, 2, HEIGHT // 4, WIDTH // 4), -1000.0, np.float32))  # fmt: skip
+    path = write_detector(tmp_path / "n.onnx", SIZE, outputs)
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([1], [0.5])
+    assert found.masks.shape[0] == 1 and not found.masks.any()
+
+
 def test_words_that_do_not_fit_are_told(tmp_path):
     for form, words, said in (
         ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
@@ -372,6 +394,7 @@ def test_words_that_do_not_fit_are_told(tmp_path):
             {"task": "boxes"},
             "`task` must be one of detect, pose, obb, segment, got boxes",
         ),
+        ("own", {"task": "pose"}, "`task` is pose, but the form '.*' has no keypoints"),
         ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
         ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
     ):

@@ -60,6 +60,9 @@ def test_a_detector_of_any_form(tmp_path, outputs, batch, dtype, channels_last):
     network = OnnxNetwork(path, count=3)
     assert (network.kind, network.size, network.channels) == ("detections", SIZE, 3)
     assert network.output == ("uint8" if dtype == "uint8" else "image")
+    assert network(pictures(network.output)[:0]) == []
+    with pytest.raises(TypeError, match=r"takes pictures of .*, got "):
+        network(pictures("image" if dtype == "uint8" else "uint8"))
     takes = 1 if "one picture" in outputs else 3
     assert network.batch == (batch if isinstance(batch, int) else takes)
     seen = pictures(network.output)
@@ -86,6 +89,7 @@ def test_maps_and_numbers_of_a_network(tmp_path, batch, channels_last):
     network = OnnxNetwork(write_graph(tmp_path / "m.onnx", "maps", **options), count=3)
     found = network(seen)
     assert network.kind == "maps" and list(found) == ["halves", "grey"]
+    assert network(seen[:0])["halves"].shape == (0, 3, 8, 12)
     halves = seen.reshape(3, 3, 8, 2, 12, 2).mean((3, 5))
     np.testing.assert_allclose(found["halves"], halves, atol=1e-6)
     np.testing.assert_allclose(found["grey"], seen.mean(1, keepdims=True), atol=1e-6)

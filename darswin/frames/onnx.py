@@ -58,6 +58,7 @@ class OnnxNetwork:
         ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
             no known form, or of several, or the size is missing or not that of the graph.
         FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
+        TypeError: in a call, the pictures are not those of `output`.
 
     Attributes:
         size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
@@ -156,18 +157,22 @@ class OnnxNetwork:
         return True
 
     def __call__(self, pictures: np.ndarray) -> list[Detections] | dict[str, np.ndarray]:
-        if pictures.dtype == np.uint8:
+        is_uint8 = pictures.dtype == np.uint8
+        if self._is_seen and is_uint8 != (self.output == "uint8"):
+            wanted = "uint8" if self.output == "uint8" else "floating point, normalized"
+            raise TypeError(f"{self.path} takes pictures of {wanted}, got {pictures.dtype}")
+        if is_uint8:
             pictures = np.moveaxis(pictures.reshape(-1, *self.size, self.channels), -1, 1)
         pictures = pictures.reshape(-1, self.channels, *self.size)
         found: list[Any] = []
-        for start in range(0, len(pictures), self.batch):
+        for start in range(0, max(1, len(pictures)), self.batch):
             part = pictures[start : start + self.batch]
             spare = np.zeros((self.batch - len(part), *part.shape[1:]), part.dtype)
             found += self._run(np.concatenate((part, spare)))
-        found = found[: len(pictures)]
+        count = len(pictures)
         if isinstance(found[0], Detections):
-            return found
-        return {name: np.stack([each[name] for each in found]) for name in found[0]}
+            return found[:count]
+        return {name: np.stack([each[name] for each in found])[:count] for name in found[0]}
 
     def _run(self, pictures: np.ndarray) -> list[Any]:
         """What one batch (B, C, H, W) shows, for each picture: `Detections`, or its outputs."""

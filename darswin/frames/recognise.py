@@ -11,6 +11,7 @@ from darswin.frames.forms import Form, Outputs, Pixels, Size, Where, cells, grid
 from darswin.utils.parameters import check, naming
 
 TASKS = ("detect", "pose", "obb", "segment")  # of Ultralytics
+_PARTS = {"pose": ("points", "keypoints"), "obb": ("turn", "turned boxes")}
 SCORES = ("softmax", "sigmoid")
 _RT_DETR = "RT-DETR of Ultralytics"
 _PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
@@ -53,6 +54,10 @@ def form_of(
     outputs = {name: values for name, values in outputs.items() if values.ndim < 5}  # no raw heads
     form = _named(outputs) or _typed(outputs) or _pair(outputs, size)
     form = form or _table(outputs, size, own or "", metadata)
+    part, found = _PARTS.get(str(task), ("boxes", "boxes"))
+    if form is not None and part not in form.where:
+        text = f"`task` is {task}, but the form {form.name!r} has no {found}"
+        raise naming(ValueError(text), "task")
     if form is not None and form.scores == "?":
         kind = _MODELS.get(scores or str(metadata.get("model_type")))
         if kind is None:

@@ -73,7 +73,8 @@ def detections_to_images(
         remap = prepared.remaps[min(k, len(prepared.remaps) - 1)]
         tiles = found[k * view.count : (k + 1) * view.count]
         carried = [_carried(part, tile) for part, tile in zip(tiles, remap.tiles, strict=True)]
-        joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
+        of_all = [name for name in carried[0] if all(name in part for part in carried)]
+        joined = {name: torch.cat([part[name] for part in carried]) for name in of_all}
         counts = [len(part["boxes"]) for part in carried]
         sources = torch.arange(view.count).repeat_interleave(torch.tensor(counts))
         joined["sources"] = sources.to(joined["boxes"].device)

@@ -74,6 +74,7 @@ CASES = [
     ("dat", dict(image_size=(16, 40), window=(2, 5), blocks=("D", "LD", "DS"), groups=(1, 2, 4))),
     ("dat", dict(depths=(2, 1, 2), blocks=("DL", "D", "D"), groups=(1, 1, 1), offset_range=9.0)),
     *(("adapter", dict(network=name, view=view)) for name, view in ADAPTERS),
+    ("adapter", dict(network="swin", view="mercator", output="view")),
 ]
 
 
@@ -88,7 +89,8 @@ def made(family, channels=3, **options):
     else:
         network = model_of(name, channels, **dict(rays=False) if name == "conv_unet" else {})
     given = dict(zip(("mean", "std"), (MEAN, STD) if channels == 3 else (0.4, 0.2), strict=True))
-    return LensAdapter(network, view=make_view(view, size, **given)).eval()
+    output = options.get("output", "pixels")
+    return LensAdapter(network, view=make_view(view, size, **given), output=output).eval()
 
 
 def classifies(model):

@@ -234,6 +234,10 @@ def test_odd_boxes_of_networks(name):
     batched = {k: v[None].expand(tiles, *v.shape) if v.dim() else v for k, v in out.items()}
     (same,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: batched)(images, lens)
     assert torch.equal(same["boxes"], found["boxes"])
+    empty = {name: value[:0] if value.dim() else value for name, value in out.items()}
+    some = [dict(out, number=torch.tensor([3])), *[dict(empty, number=torch.tensor([3]))] * 4]
+    (one,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: some[:tiles])(images, lens)
+    assert len(one["boxes"]) == 1
     none = dict(out, boxes=torch.full((1, 4), math.nan))
     (empty,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: [none] * tiles)(images, lens)
     assert empty["boxes"].shape == (0, 4)
