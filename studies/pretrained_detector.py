@@ -18,7 +18,7 @@ from pretrained_scenes import COCO
 from torch import Tensor
 
 PACKAGE = (
-    "npm pack @vladmandic/human@3.3.6",
+    "npm pack --silent @vladmandic/human@3.3.6",
     "vladmandic-human-*.tgz",
     "425e9c51dbbca0c8934362b170cb0d54c2529c11c654b3c03092b16e9d6ad3f7",
 )
