@@ -1,7 +1,9 @@
 """The pretrained study: its graphs, scenes and scores, and the whole on made-up networks."""
 
+import hashlib
 import json
 import math
+import tarfile
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 import onnxruntime
 import pretrained
 import pretrained_crops
+import pretrained_detector
 import pretrained_files
 import pretrained_methods
 import pretrained_people
@@ -28,7 +31,7 @@ from pretrained_scores import average_precision, match, rows_of, scores
 from torch import Tensor, nn
 
 from darswin import boxes, lens
-from darswin.frames.onnx import Detections
+from darswin.frames.onnx import Detections, OnnxNetwork
 from darswin.lens import KannalaBrandt
 
 
@@ -257,6 +260,32 @@ def test_decoding_is_in_the_graph_of_the_network(made_up, tmp_path, monkeypatch,
         assert (boxes.iou(own, own) - np.eye(len(own))).max() <= 0.6
     assert one[0][0] == pytest.approx(box, abs=1e-3) and one[2][0] == 7
     assert one[1].tolist() == pytest.approx([0.9] + [0] * (FOUND - 1))
+
+
+@pytest.mark.slow
+def test_the_detector_of_the_tutorial_takes_0_to_1_and_has_names(made_up, tmp_path, monkeypatch):
+    package, file = tmp_path / "vladmandic-human-3.3.6.tgz", tmp_path / "detector.onnx"
+    with tarfile.open(package, "w:gz") as archive:
+        archive.add(made_up / "files" / "package", "package")
+    known = hashlib.sha256(package.read_bytes()).hexdigest()
+    fetched = f"cp {package} .", "vladmandic-human-*.tgz", known
+    monkeypatch.setattr(pretrained_detector, "PACKAGE", fetched)
+    monkeypatch.setattr(pretrained_detector.Detector, "side", 64)
+    pretrained_detector.write(file)
+    network = OnnxNetwork(file, threshold=0)
+    assert network.form == "boxes, scores and labels" and network.size == (64, 64)
+    assert network.names == dict(enumerate(COCO)) and network.names[2] == "car"
+    image = 0.2 * torch.randn(1, 3, 64, 64)
+    (found,) = network(image.numpy())
+    with torch.inference_mode():
+        known = DETECTORS["CenterNet"](Files(made_up)("package/models"))(255 * image)
+    scores = known[1][0].numpy()
+    steps = -np.diff(scores, prepend=1, append=0)
+    clear = np.minimum(steps[:-1], steps[1:]) > 1e-5  # equal scores have no order
+    assert scores[0] > 0.1 and clear.sum() > 20, scores
+    np.testing.assert_allclose(found.scores, scores, atol=1e-5)
+    np.testing.assert_allclose(found.boxes[clear], known[0][0][clear], atol=1e-2)
+    assert (found.labels[clear] == known[2][0].numpy()[clear]).all()
 
 
 # -- scenes ---------------------------------------------------------------------------------------

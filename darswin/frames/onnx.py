@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from darswin.frames.forms import RGB, Detections, Form, decode
-from darswin.frames.recognise import SCORES, TASKS, form_of, names_of
+from darswin.frames.recognise import SCORES, TASKS, form_of, imgsz_of, names_of
 from darswin.utils.extras import lack
 from darswin.utils.files import check_is_file
 from darswin.utils.parameters import check, naming
@@ -47,7 +47,8 @@ class OnnxNetwork:
     Args:
         path: the ONNX file. A config.json of transformers beside it, or above its folder "onnx",
             says what its outputs do not.
-        size: (H, W) of the pictures. None means that of the graph, which must then have one.
+        size: (H, W) of the pictures. None means that of the graph, or else of the metadata of
+            Ultralytics, one of which must then have one.
         count: the usual number of pictures in a call. They are one batch if the network takes it.
         threshold: the lowest score of a detection. Others are left out.
         task: detect, pose, obb or segment, of a file of Ultralytics that lost its metadata.
@@ -85,6 +86,8 @@ class OnnxNetwork:
         self._metadata = self._read_metadata()
         self.names = names_of(self._metadata)
         own, batch = self._read_input()
+        if size is None and None in own:
+            size = imgsz_of(self._metadata)
         if size is None and None in own:
             text = f"missing `size`: {self.path} takes pictures of any size, so choose one"
             raise naming(ValueError(text), "size")

@@ -1,6 +1,7 @@
 """Which form the outputs of a detector have: by metadata, names, shapes and types."""
 
 import ast
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -67,7 +68,21 @@ def form_of(
     if scores is not None:
         text = "`scores` is for the logits of transformers, so leave it out"
         raise naming(ValueError(text), "scores")
+    if form is not None and form.overlaps:
+        _check_scores(form, outputs)
     return form
+
+
+def _check_scores(form: Form, outputs: Outputs) -> None:
+    """ValueError for scores that are no probabilities, of a form whose scores are some."""
+    for name, columns in (form.where[key] for key in ("scores", "objectness") if key in form.where):
+        values = outputs[name].swapaxes(1, 2) if form.things_last else outputs[name]
+        low, high = values[..., columns].min(), values[..., columns].max()
+        if low < -0.01 or high > 1.01:
+            raise ValueError(
+                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
+                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
+            )
 
 
 def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
@@ -79,6 +94,12 @@ def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
         return {int(number): str(name) for number, name in pairs}
     except (ValueError, TypeError, SyntaxError):
         return {}
+
+
+def imgsz_of(metadata: Mapping[str, Any]) -> tuple[int, int] | None:
+    """The (H, W) in the metadata of Ultralytics, which graphs of any size have too."""
+    found = re.fullmatch(r"\[(\d+), (\d+)\]", str(metadata.get("imgsz")))
+    return (int(found[1]), int(found[2])) if found else None
 
 
 def _question(word: str, found: str, instead: str) -> ValueError:
