@@ -77,9 +77,10 @@ def look(
         options = {"count": int(count)} if count else {}
         view = make_view(kind, (SIDE, SIDE), up=tuple(up), **options)
         parts = through(network, picture, view.at(camera, picture.shape[:2]))
-    found = Detections(*(np.concatenate(of) for of in zip(*parts, strict=True)))
+    columns = zip(*((part.boxes, part.scores, part.labels) for part in parts), strict=True)
+    found = [np.concatenate(column) for column in columns]
     kept = boxes.merge(*found)
-    return Detections(*(of[kept] for of in found))
+    return Detections(*(column[kept] for column in found))
 
 
 def up_in(calibration: Path, pitch: float) -> tuple[float, float, float]:

@@ -477,7 +477,7 @@ def test_real_pictures_are_seen_in_each_way(way):
 
 
 def test_a_real_picture_is_level_by_its_calibration_or_by_the_pitch(tmp_path):
-    content = json.loads(Path("examples/front.json").read_text())
+    content = json.loads(Path("examples/room.json").read_text())
     pose = dict(quaternion=[0.5, -0.5, 0.5, -0.5], translation=[0, 0, 1])  # of a level camera
     (tmp_path / "car.json").write_text(json.dumps(content | dict(extrinsic=pose)))
     assert real_pictures.up_in(tmp_path / "car.json", 30.0) == pytest.approx((0, -1, 0), abs=1e-9)
