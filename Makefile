@@ -93,7 +93,7 @@ test-asan: sanitized  ## test the operators on every tier with AddressSanitizer 
 	  $(SANITIZER) ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
 	      -m "not unsanitized" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py \
-      $(ROOT)/tests/deploy/test_contract.py; \
+	      $(ROOT)/tests/deploy/test_contract.py; \
 	done
 
 # The modules of another compiler, in the same way. Needs `apt-get install clang-16`.

@@ -135,8 +135,13 @@ def protos():
 
 WEIGHTS = np.eye(K, 32)
 IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
-# A table of K things and as many that are nothing, as networks fill them up.
-FULL = lambda rows, to=300: np.concatenate((rows, np.zeros((to - K, *rows.shape[1:]))))  # noqa: E731
+
+
+def full(rows, to=300):
+    """A table of K things, and nothing in the rest, as networks fill it up."""
+    return np.concatenate((rows, np.zeros((to - K, *rows.shape[1:]))))
+
+
 ULTRA = dict(names=NAMES, author="Ultralytics", imgsz=[*SIZE])
 SOFTMAX_ = np.log(np.column_stack((one_hot(91, low=1e-9), 1 - SCORES - 90e-9)))
 POSE = ULTRA | dict(task="pose", kpt_shape=[17, 3], names={0: "person"})
@@ -153,9 +158,9 @@ def row(values, *more):
 
 # Each form: its outputs without their batch, and how the network is written and read.
 FORMS = {
-    "own": (dict(boxes=FULL(BOXES), scores=FULL(SCORES), labels=FULL(LABELS).astype(int)), {}),
+    "own": (dict(boxes=full(BOXES), scores=full(SCORES), labels=full(LABELS).astype(int)), {}),
     "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
-    "table": (dict(out=FULL(ROWS)), {}),
+    "table": (dict(out=full(ROWS)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
     "detect without task": (
         dict(output0=yolo(beside(CENTRED, one_hot(80)))),
@@ -172,26 +177,26 @@ FORMS = {
         dict(metadata=POSE | {"kpt_shape": [17, 2]}),
     ),
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
-    "detect, end to end": (dict(output0=FULL(ROWS)), of("detect")),
+    "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=FULL(beside(ROWS, WEIGHTS)), output1=protos()),
+        dict(output0=full(beside(ROWS, WEIGHTS)), output1=protos()),
         of("segment"),
     ),
     "pose, end to end": (
-        dict(output0=FULL(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
+        dict(output0=full(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
     ),
     "obb, end to end": (
-        dict(output0=FULL(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
+        dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
     ),
     "RT-DETR of Ultralytics": (
-        dict(output0=FULL(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
+        dict(output0=full(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
     ),
     "RT-DETR of Ultralytics, the best": (
-        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))),
+        dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))),
         dict(metadata=ULTRA | {"task": "detect", "head": "RTDETRDecoder"}),
     ),
     "RT-DETR of Ultralytics, older": (
-        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
+        dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
     ),
     "YOLOv5": (
         dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
@@ -217,8 +222,8 @@ FORMS = {
     "YOLOX, decoded": (dict(output=yolox(True)), {}),
     "NanoDet-Plus": (dict(output=nanodet()), {}),
     "RF-DETR": (
-        dict(dets=FULL(CENTRED_PARTS),
-             labels=FULL(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
+        dict(dets=full(CENTRED_PARTS),
+             labels=full(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
     ),
     "RF-DETR segment": (
         dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
@@ -244,9 +249,9 @@ FORMS = {
         dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
     ),
     "EfficientNMS": (
-        dict(num_dets=np.array([K]), det_boxes=FULL(BOXES, 100),
-             det_scores=FULL(SCORES, 100) - (np.arange(100) >= K),
-             det_classes=FULL(LABELS, 100).astype(int)), {},
+        dict(num_dets=np.array([K]), det_boxes=full(BOXES, 100),
+             det_scores=full(SCORES, 100) - (np.arange(100) >= K),
+             det_classes=full(LABELS, 100).astype(int)), {},
     ),
     "YOLO-NAS": (
         dict(boxes=dense(BOXES, lambda x, y, s: (x * s, y * s, x * s + s, y * s + s)),

@@ -21,7 +21,7 @@ Size = tuple[int, int]
 def without_overlaps(one: Detections) -> Detections:
     """The best of the boxes that show the same thing, for a network that leaves this to others."""
     kept = boxes.merge(_boxes_of(one), one.scores, one.labels, inside=1.0)
-    return Detections(*(None if values is None else values[kept] for values in one))  # type: ignore[arg-type]
+    return Detections._make(None if values is None else values[kept] for values in one)
 
 
 def _boxes_of(one: Detections) -> np.ndarray:
