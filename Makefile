@@ -28,6 +28,8 @@ demo: build  ## train on nearly undistorted digits, test through fisheye lenses,
 	$(BIN)/python examples/digits.py
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
+# The tests of what is compiled: other tiers, compilers and sanitizers run them too.
+COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/deploy/test_contract.py
 PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
 test: build  ## run the fast tests: values, gradients, errors
@@ -70,7 +72,7 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q tests/ops tests/test_frames.py tests/test_frame_*.py \
+	    $(PYTEST) -q $(COMPILED) \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
@@ -92,7 +94,7 @@ test-asan: sanitized  ## test the operators on every tier with AddressSanitizer 
 	  echo "== $$tier, sanitized"; \
 	  $(SANITIZER) ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
-	      -m "not unsanitized" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py; \
+	      -m "not unsanitized" $(COMPILED); \
 	done
 
 # The modules of another compiler, in the same way. Needs `apt-get install clang-16`.
@@ -107,7 +109,7 @@ test-clang: build  ## test the operators and frames as clang compiles them; CLAN
 	@PATH=$(ROOT)/$(BIN):$$PATH CXX=$(CLANG_CXX) DARSWIN_BUILD=cmake-clang \
 	  $(BIN)/python setup.py -q build --build-lib $(CLANG)
 	@cd $(CLANG); DARSWIN_BUILD=cmake-clang $(PYTEST) -q -c $(ROOT)/pyproject.toml \
-	  --rootdir $(ROOT) -m "not slow" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/test_build.py
+	  --rootdir $(ROOT) -m "not slow" $(COMPILED) $(ROOT)/tests/test_build.py
 
 FUZZ := $(ROOT)/$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz
 fuzz: sanitized  ## call the operators with hostile arguments, read 100,000 wrong calibrations and 250,000 wrong files of cameras (45 minutes)
@@ -261,7 +263,7 @@ aarch64: $(STAMP) $(AARCH64)/installed  ## cross-compile for ARM (aarch64); the 
 
 test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
 	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(ROOT)/pyproject.toml \
-	  --rootdir $(ROOT) -m "not slow" $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py
+	  --rootdir $(ROOT) -m "not slow" $(COMPILED)
 
 clean:  ## remove all build results
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/frames/*.so

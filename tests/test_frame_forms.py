@@ -135,8 +135,13 @@ def protos():
 
 WEIGHTS = np.eye(K, 32)
 IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
-# A table of K things and as many that are nothing, as networks fill them up.
-FULL = lambda rows, to=300: np.concatenate((rows, np.zeros((to - K, *rows.shape[1:]))))  # noqa: E731
+
+
+def full(rows, to=300):
+    """A table of K things, and nothing in the rest, as networks fill it up."""
+    return np.concatenate((rows, np.zeros((to - K, *rows.shape[1:]))))
+
+
 ULTRA = dict(names=NAMES, author="Ultralytics", imgsz=[*SIZE])
 SOFTMAX_ = np.log(np.column_stack((one_hot(91, low=1e-9), 1 - SCORES - 90e-9)))
 POSE = ULTRA | dict(task="pose", kpt_shape=[17, 3], names={0: "person"})
@@ -153,9 +158,9 @@ def row(values, *more):
 
 # Each form: its outputs without their batch, and how the network is written and read.
 FORMS = {
-    "own": (dict(boxes=FULL(BOXES), scores=FULL(SCORES), labels=FULL(LABELS).astype(int)), {}),
+    "own": (dict(boxes=full(BOXES), scores=full(SCORES), labels=full(LABELS).astype(int)), {}),
     "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
-    "table": (dict(out=FULL(ROWS)), {}),
+    "table": (dict(out=full(ROWS)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
     "detect without task": (
         dict(output0=yolo(beside(CENTRED, one_hot(80)))),
@@ -172,26 +177,26 @@ FORMS = {
         dict(metadata=POSE | {"kpt_shape": [17, 2]}),
     ),
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
-    "detect, end to end": (dict(output0=FULL(ROWS)), of("detect")),
+    "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=FULL(beside(ROWS, WEIGHTS)), output1=protos()),
+        dict(output0=full(beside(ROWS, WEIGHTS)), output1=protos()),
         of("segment"),
     ),
     "pose, end to end": (
-        dict(output0=FULL(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
+        dict(output0=full(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
     ),
     "obb, end to end": (
-        dict(output0=FULL(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
+        dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
     ),
     "RT-DETR of Ultralytics": (
-        dict(output0=FULL(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
+        dict(output0=full(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
     ),
     "RT-DETR of Ultralytics, the best": (
-        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))),
+        dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))),
         dict(metadata=ULTRA | {"task": "detect", "head": "RTDETRDecoder"}),
     ),
     "RT-DETR of Ultralytics, older": (
-        dict(output0=FULL(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
+        dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
     ),
     "YOLOv5": (
         dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
@@ -217,8 +222,8 @@ FORMS = {
     "YOLOX, decoded": (dict(output=yolox(True)), {}),
     "NanoDet-Plus": (dict(output=nanodet()), {}),
     "RF-DETR": (
-        dict(dets=FULL(CENTRED_PARTS),
-             labels=FULL(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
+        dict(dets=full(CENTRED_PARTS),
+             labels=full(logit(one_hot(91))) - 9 * (np.arange(300)[:, None] >= K)), {},
     ),
     "RF-DETR segment": (
         dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
@@ -244,9 +249,9 @@ FORMS = {
         dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
     ),
     "EfficientNMS": (
-        dict(num_dets=np.array([K]), det_boxes=FULL(BOXES, 100),
-             det_scores=FULL(SCORES, 100) - (np.arange(100) >= K),
-             det_classes=FULL(LABELS, 100).astype(int)), {},
+        dict(num_dets=np.array([K]), det_boxes=full(BOXES, 100),
+             det_scores=full(SCORES, 100) - (np.arange(100) >= K),
+             det_classes=full(LABELS, 100).astype(int)), {},
     ),
     "YOLO-NAS": (
         dict(boxes=dense(BOXES, lambda x, y, s: (x * s, y * s, x * s + s, y * s + s)),
@@ -364,6 +369,28 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         check_known(form, found)
 
 
+@pytest.mark.parametrize("last", [17.0, 1.0])
+def test_scores_of_1_are_no_classes(tmp_path, last):
+    """In tables with the number of the picture, whose class may stand before the score or after."""
+    row = [0, 10, 20, 30, 40, 18.0 - last, last]
+    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row], np.float32)})
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
+
+
+@pytest.mark.filterwarnings("error")
+def test_logits_may_be_very_low(tmp_path):
+    """They have a probability of 0, and masks of them show nothing."""
+    low = np.full((1, 2, 3), -1000.0, np.float32)
+    low[0, 0, 1] = 0
+    outputs = dict(dets=np.full((1, 2, 4), 0.5, np.float32), labels=low,
+                   masks=np.full((1, 2, HEIGHT // 4, WIDTH // 4), -1000.0, np.float32))  # fmt: skip
+    path = write_detector(tmp_path / "n.onnx", SIZE, outputs)
+    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
+    assert (found.labels.tolist(), found.scores.tolist()) == ([1], [0.5])
+    assert found.masks.shape[0] == 1 and not found.masks.any()
+
+
 def test_words_that_do_not_fit_are_told(tmp_path):
     for form, words, said in (
         ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
@@ -372,6 +399,7 @@ def test_words_that_do_not_fit_are_told(tmp_path):
             {"task": "boxes"},
             "`task` must be one of detect, pose, obb, segment, got boxes",
         ),
+        ("own", {"task": "pose"}, "`task` is pose, but the form '.*' has no keypoints"),
         ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
         ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
     ):
@@ -397,3 +425,15 @@ def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
     for value, kind in ((seven, "numbers"), (pooled, "maps")):
         path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
         assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
+
+
+def test_boxes_of_cells_are_corners_with_probabilities(tmp_path):
+    """As of YOLO-NAS. Middles and sizes, or logits, are refused."""
+    cells = priors(8, 16, 32)
+    middles = np.column_stack(((cells[:, :2] + 0.5) * cells[:, 2:], cells[:, 2], cells[:, 2]))
+    scores = np.full((len(cells), 9), 0.1)
+    for boxes, given in ((middles, scores), (np.abs(middles).cumsum(1), scores - 2)):
+        outputs = dict(a=boxes[None].astype(np.float32), b=given[None].astype(np.float32))
+        path = write_detector(tmp_path / "n.onnx", SIZE, outputs)
+        with pytest.raises(ValueError, match=r"outputs a .*, b .*; known are the forms"):
+            OnnxNetwork(path)

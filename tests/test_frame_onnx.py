@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from graphs import DETECTORS, write_graph
+from graphs import DETECTORS, write_detector, write_graph
 
 from darswin.frames.onnx import OnnxNetwork
 
@@ -60,6 +60,9 @@ def test_a_detector_of_any_form(tmp_path, outputs, batch, dtype, channels_last):
     network = OnnxNetwork(path, count=3)
     assert (network.kind, network.size, network.channels) == ("detections", SIZE, 3)
     assert network.output == ("uint8" if dtype == "uint8" else "image")
+    assert network(pictures(network.output)[:0]) == []
+    with pytest.raises(TypeError, match=r"takes pictures of .*, got "):
+        network(pictures("image" if dtype == "uint8" else "uint8"))
     takes = 1 if "one picture" in outputs else 3
     assert network.batch == (batch if isinstance(batch, int) else takes)
     seen = pictures(network.output)
@@ -86,6 +89,7 @@ def test_maps_and_numbers_of_a_network(tmp_path, batch, channels_last):
     network = OnnxNetwork(write_graph(tmp_path / "m.onnx", "maps", **options), count=3)
     found = network(seen)
     assert network.kind == "maps" and list(found) == ["halves", "grey"]
+    assert network(seen[:0])["halves"].shape == (0, 3, 8, 12)
     halves = seen.reshape(3, 3, 8, 2, 12, 2).mean((3, 5))
     np.testing.assert_allclose(found["halves"], halves, atol=1e-6)
     np.testing.assert_allclose(found["grey"], seen.mean(1, keepdims=True), atol=1e-6)
@@ -107,6 +111,22 @@ def test_maps_have_the_order_of_axes_of_the_input(tmp_path):
     np.testing.assert_equal(OnnxNetwork(tmp_path / "n.onnx")(pictures())["same"], -pictures())
 
 
+def test_scores_of_overlapping_boxes_must_be_probabilities(tmp_path):
+    """A YOLOX without its sigmoid, as some exports have it, has the shape of one with it."""
+    table = np.random.default_rng(3).uniform(0, 1, (1, 189, 85)).astype(np.float32)
+    for low, high, is_known in ((0, 1, True), (-9, 0, False), (0, 4, False)):
+        for columns in (slice(4, 5), slice(5, 85)):
+            changed = table.copy()
+            changed[..., columns] = low + (high - low) * table[..., columns]
+            path = write_detector(tmp_path / "n.onnx", (96, 96), {"out": changed})
+            if is_known:
+                assert OnnxNetwork(path).form == "YOLOX"
+                continue
+            said = "that of YOLOX, but its scores must be from 0 to 1, got .*sigmoid"
+            with pytest.raises(ValueError, match=said):
+                OnnxNetwork(path)
+
+
 def test_the_size_is_the_graphs_or_given(tmp_path):
     free = write_graph(tmp_path / "free.onnx")
     wide = write_graph(tmp_path / "wide.onnx", size=("H", 24))
@@ -116,6 +136,11 @@ def test_the_size_is_the_graphs_or_given(tmp_path):
     for path in (free, wide):
         with pytest.raises(ValueError, match=r"missing `size`: .* takes pictures of any size"):
             OnnxNetwork(path)
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(free)
+    onnx.helper.set_model_props(model, {"imgsz": "[16, 24]"})  # as Ultralytics writes it
+    onnx.save(model, free)
+    assert OnnxNetwork(free).size == (16, 24) and OnnxNetwork(free, (32, 8)).size == (32, 8)
     for path, size, wanted in (
         (fixed, (24, 16), "16,24 for"), (fixed, (16, 25), "16,24"), (wide, (16, 16), "any,24"),
     ):  # fmt: skip

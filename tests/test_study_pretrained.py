@@ -1,7 +1,9 @@
 """The pretrained study: its graphs, scenes and scores, and the whole on made-up networks."""
 
+import hashlib
 import json
 import math
+import tarfile
 from pathlib import Path
 
 import cv2
@@ -9,24 +11,28 @@ import numpy as np
 import onnxruntime
 import pretrained
 import pretrained_crops
+import pretrained_detector
 import pretrained_files
 import pretrained_methods
 import pretrained_people
 import pretrained_scenes
 import pretrained_tables
 import pytest
+import real_pictures
 import tfjs
 import torch
 import torch.nn.functional as F
 from helpers import in_this_process
 from pretrained_files import Files
 from pretrained_graphs import DETECTORS, FOUND, OPERATORS, Graph, export
-from pretrained_methods import Found, Look, tiles
+from pretrained_methods import Found, Look, slices, tiles
 from pretrained_scenes import CLASSES, COCO, SIZE, SPLITS, Scene, Thing
 from pretrained_scores import average_precision, match, rows_of, scores
 from torch import Tensor, nn
 
-from darswin import boxes
+from darswin import boxes, lens
+from darswin.frames.onnx import Detections, OnnxNetwork
+from darswin.lens import KannalaBrandt
 
 
 def random(rng, *shape, scale=0.3):
@@ -256,6 +262,32 @@ def test_decoding_is_in_the_graph_of_the_network(made_up, tmp_path, monkeypatch,
     assert one[1].tolist() == pytest.approx([0.9] + [0] * (FOUND - 1))
 
 
+@pytest.mark.slow
+def test_the_detector_of_the_tutorial_takes_0_to_1_and_has_names(made_up, tmp_path, monkeypatch):
+    package, file = tmp_path / "vladmandic-human-3.3.6.tgz", tmp_path / "detector.onnx"
+    with tarfile.open(package, "w:gz") as archive:
+        archive.add(made_up / "files" / "package", "package")
+    known = hashlib.sha256(package.read_bytes()).hexdigest()
+    fetched = f"cp {package} .", "vladmandic-human-*.tgz", known
+    monkeypatch.setattr(pretrained_detector, "PACKAGE", fetched)
+    monkeypatch.setattr(pretrained_detector.Detector, "side", 64)
+    pretrained_detector.write(file)
+    network = OnnxNetwork(file, threshold=0)
+    assert network.form == "boxes, scores and labels" and network.size == (64, 64)
+    assert network.names == dict(enumerate(COCO)) and network.names[2] == "car"
+    image = 0.2 * torch.randn(1, 3, 64, 64)
+    (found,) = network(image.numpy())
+    with torch.inference_mode():
+        known = DETECTORS["CenterNet"](Files(made_up)("package/models"))(255 * image)
+    scores = known[1][0].numpy()
+    steps = -np.diff(scores, prepend=1, append=0)
+    clear = np.minimum(steps[:-1], steps[1:]) > 1e-5  # equal scores have no order
+    assert scores[0] > 0.1 and clear.sum() > 20, scores
+    np.testing.assert_allclose(found.scores, scores, atol=1e-5)
+    np.testing.assert_allclose(found.boxes[clear], known[0][0][clear], atol=1e-2)
+    assert (found.labels[clear] == known[2][0].numpy()[clear]).all()
+
+
 # -- scenes ---------------------------------------------------------------------------------------
 
 
@@ -396,13 +428,62 @@ def test_detections_come_back_to_the_picture(made_up):
             inner = ((found > 1) & (found < np.array(image.shape[:0:-1] * 2) - 1)).all(1)
             return found[inner], np.full(inner.sum(), 0.9), np.zeros(inner.sum(), int)
 
-    for look in (Look("raw"), Look("mercator"), Look("square"), Look("stereographic"), tiles(5)):
+    for look in (Look("raw"), Look("mercator"), Look("square"), Look("stereographic"), tiles(5),
+                 slices(2, 576), slices(3, 512), slices(3, 410)):  # fmt: skip
         found = pretrained_methods.merged(
             [pretrained_methods.detect(look, scene, picture, Squares())]
         )
         overlaps = boxes.iou(truth, found.boxes.astype(float))
         assert (overlaps.max(1) > 0.7).all(), (look, overlaps)
         assert len(found.boxes) == 3, look
+
+
+def test_slices_cover_the_picture_evenly():
+    for count, side, steps in (
+        (2, 576, [0, 448]),
+        (3, 512, [0, 256, 512]),
+        (3, 410, [0, 307, 614]),
+    ):
+        look = slices(count, side)
+        squares = pretrained_methods.squares(look)
+        assert squares == [(x, y, side) for y in steps for x in steps]
+        assert pretrained_methods.runs_of((look, Look("raw"), tiles(5))) == count**2 + 6
+    assert pretrained_methods.squares(Look("raw")) == [(0, 0, SIZE)]
+
+
+@pytest.mark.parametrize("way", ["raw", "slices:2", "slices:3", "mercator", "tiles:5"])
+def test_real_pictures_are_seen_in_each_way(way):
+    """A detector of white discs finds those of a wide picture, where they are."""
+    picture = np.zeros((480, 640, 3), np.uint8)
+    middles = np.array([[320, 240], [420, 260], [250, 190]])
+    for middle in middles.tolist():
+        cv2.circle(picture, middle, 20, (255, 255, 255), -1)
+
+    def discs(images: np.ndarray) -> list[Detections]:
+        found = []
+        for image in images:
+            *_, rows, _ = cv2.connectedComponentsWithStats((image[0] > 127).astype(np.uint8))
+            x, y, width, height = rows[1:, :4].T
+            at = np.stack((x, y, x + width, y + height), 1).astype(float)
+            at = at[((at > 1) & (at < 511)).all(1)]  # what a tile cuts is not found
+            found.append(Detections(at, np.full(len(at), 0.9), np.zeros(len(at), int)))
+        return found
+
+    camera = KannalaBrandt(200.0, [0.02, 0.0, 0.0, 0.0], image_size=(480, 640))
+    found = real_pictures.look(way, discs, picture, camera, (0, -1, 0))
+    truth = np.concatenate((middles - 20, middles + 21), 1).astype(float)
+    assert len(found.boxes) == 3
+    assert (boxes.iou(truth, found.boxes).max(1) > 0.75).all()
+
+
+def test_a_real_picture_is_level_by_its_calibration_or_by_the_pitch(tmp_path):
+    content = json.loads(Path("examples/room.json").read_text())
+    pose = dict(quaternion=[0.5, -0.5, 0.5, -0.5], translation=[0, 0, 1])  # of a level camera
+    (tmp_path / "car.json").write_text(json.dumps(content | dict(extrinsic=pose)))
+    assert real_pictures.up_in(tmp_path / "car.json", 30.0) == pytest.approx((0, -1, 0), abs=1e-9)
+    camera = KannalaBrandt(200.0, [0.02, 0.0, 0.0, 0.0], image_size=(480, 640))
+    lens.save(camera, tmp_path / "own.json")
+    assert real_pictures.up_in(tmp_path / "own.json", 90.0) == pytest.approx((0, 0, -1), abs=1e-9)
 
 
 @pytest.mark.slow
@@ -413,6 +494,8 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
                ("NanoDet", "level"): dict(raw=few["raw"])}  # fmt: skip
     for module in (pretrained, pretrained_methods):
         monkeypatch.setattr(module, "STUDIED", studied)
+    parts = {"slices: 4, and raw": (slices(2, 576), few["raw"][0]), "tiles: 5": few["tiles: 5"]}
+    monkeypatch.setattr(pretrained, "SLICED", dict.fromkeys(pretrained_methods.SLICED, parts))
     monkeypatch.setattr(pretrained, "PEOPLE_METHODS", few)
     monkeypatch.setattr(pretrained, "LEVEL_METHODS", few)
     monkeypatch.setattr(pretrained, "SCENES", {"level": (48, 2), "small": (0, 1), "down": (24, 1),
@@ -430,6 +513,11 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
         for of in table["methods"].values():
             low, high = of["map_interval"]
             assert 0 <= low <= high <= 1 and 0 <= of["recall"] <= 1
+    sliced = record["slices"]["level"]
+    assert sliced["scenes"] == 2 and [of["runs"] for of in sliced["methods"].values()] == [5, 5]
+    assert sliced["methods"]["tiles: 5"]["map"] == level["methods"]["tiles: 5"]["map"]
+    (pair,) = sliced["pairs"]
+    assert (pair["first"], pair["second"]) == ("tiles: 5", "slices: 4, and raw")
     for name in ("pretrained.png", "pretrained_found.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
@@ -440,7 +528,8 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
     monkeypatch.setattr(pretrained_methods, "detect", no_network)
     pretrained.main([*where, "--collect"])
     again = json.loads((tmp_path / "pretrained.json").read_text())
-    assert again["tables"] == record["tables"] and again["pairs"] == record["pairs"]
+    for name in ("tables", "pairs", "slices"):
+        assert again[name] == record[name]
     monkeypatch.undo()
     monkeypatch.setattr(pretrained, "LEVEL_METHODS", few)
     monkeypatch.setattr(pretrained, "REPEATS", 1)
@@ -452,6 +541,11 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
     made = pretrained_tables.tables(timed)
     assert "| mercator | 1 |" in made["pretrained level"]
     assert "mercator − raw" in made["pretrained level pairs"]
+    assert "| slices: 4, and raw | 5 |" in made["pretrained slices level"]
+    assert "tiles: 5 − slices: 4, and raw" in made["pretrained slices small pairs"]
+    del timed["slices"]  # as an older record
+    older = pretrained_tables.tables(timed)
+    assert older["pretrained slices level"] == pretrained_tables.NOT_RUN
     assert "tangent picture, wrong lens" in made["pretrained crops"]
     missing = pretrained_tables.tables(None)
     assert missing == dict.fromkeys(made, pretrained_tables.NOT_RUN)

@@ -1,7 +1,7 @@
 """What a detector finds in a view, in the pixels of the picture: carried, drawn, and written."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -21,7 +21,7 @@ Size = tuple[int, int]
 def without_overlaps(one: Detections) -> Detections:
     """The best of the boxes that show the same thing, for a network that leaves this to others."""
     kept = boxes.merge(_boxes_of(one), one.scores, one.labels, inside=1.0)
-    return Detections(*(None if values is None else values[kept] for values in one))  # type: ignore[arg-type]
+    return Detections._make(None if values is None else values[kept] for values in one)
 
 
 def _boxes_of(one: Detections) -> np.ndarray:
@@ -88,14 +88,20 @@ def drawn(image: np.ndarray, found: Found, texts: Sequence[str]) -> np.ndarray:
     return picture
 
 
-def coco_results(name: str, found: Found) -> list[dict[str, Any]]:
-    """The things in one picture as entries of COCO's results. Like other tools, the id of a picture
-    is the number that its file has as a name, and else this name."""
-    stem = name.rpartition("/")[2]
+def coco_ids(names: Iterable[str]) -> dict[str, int]:
+    """The ids of pictures in COCO by their names: like other tools, the numbers that their files
+    have as names, if no two are the same. All others are known by their names."""
+    stems = {name: name.rpartition("/")[2] for name in names}
+    found = {name: int(stem) for name, stem in stems.items() if stem.isdecimal()}
+    return found if len({*found.values()}) == len(found) else {}
+
+
+def coco_results(picture: int | str, found: Found) -> list[dict[str, Any]]:
+    """The things in one picture with this id as entries of COCO's results."""
     results = []
     for k, (x0, y0, x1, y1) in enumerate(found["boxes"].tolist()):
         one = {
-            "image_id": int(stem) if stem.isdecimal() else name,
+            "image_id": picture,
             "category_id": int(found["labels"][k]),
             "bbox": rounded([x0, y0, x1 - x0, y1 - y0], 2),
             "score": rounded(float(found["scores"][k]), 4),
@@ -120,8 +126,9 @@ def yolo_lines(size: Size, found: Found) -> str:
         if "masks" in found:
             mask = boxes.decode_rle(found["masks"][k]).astype(np.uint8)
             outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-            if outlines:
-                row = (max(outlines, key=cv2.contourArea).reshape(-1, 2) + 0.5) / sides
+            outline = max(outlines, key=cv2.contourArea, default=np.zeros(0)).reshape(-1, 2)
+            if len(outline) > 2:  # or it would read as a box
+                row = (outline + 0.5) / sides
         numbers = [*row.ravel()]
         if "keypoints" in found:
             numbers += (_three(found["keypoints"][k]) / [*sides, 1]).ravel().tolist()
@@ -137,10 +144,10 @@ def _three(points: np.ndarray) -> np.ndarray:
 
 
 def rounded(values: Any, digits: int) -> Any:
-    """Numbers in lists for JSON, which has no NaN."""
+    """Numbers in lists for JSON, which has no NaN and no infinity."""
     if np.ndim(values):
         return [rounded(value, digits) for value in values]
-    return None if math.isnan(values) else round(float(values), digits)
+    return round(float(values), digits) if math.isfinite(values) else None
 
 
 def entries(found: Found, columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ import torch
 from darswin import boxes
 from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_overlay
 from darswin.cli.found import (
+    coco_ids,
     coco_results,
     drawn,
     entries,
@@ -200,6 +201,7 @@ class NetworkAnswers(Answers):
     def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
         """Says where files go, which numbers do not need; names: those of `file_names`."""
         self._out, self._names = out or Path(), names
+        self._ids = coco_ids(names.values())
         return self
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
@@ -257,7 +259,8 @@ class NetworkAnswers(Answers):
             "ray": rounded(there.ray, 6),
         }
         name = file_of(entry, self._names)
-        self._results += coco_results(name, things) if self._format == "coco" else []
+        if self._format == "coco":
+            self._results += coco_results(self._ids.get(name, name), things)
         if self._format == "yolo":
             lines = yolo_lines((image.shape[0], image.shape[1]), things)
             replace_file(self._out / f"labels/{name}.txt", lines)
@@ -265,7 +268,7 @@ class NetworkAnswers(Answers):
         return {"overlay": picture, "detections": entries(things, columns)}
 
     def flush(self) -> None:
-        if self._format == "coco" and self._results:
+        if self._format == "coco":
             replace_file(self._out / RESULTS, json.dumps(self._results, allow_nan=False))
 
     def _name(self, label: int) -> str | int:

@@ -172,7 +172,7 @@ def predict(
         raise naming(ValueError(text), "top")
     prints = kind in ("classification", "numbers")
     files = pictures_and_videos(paths, leave_out=None if prints else out)
-    names = [file.name for file in files]
+    names = [stream_name(file.name) for file in files]
     read = [*names, str(weights), *([] if lens is None else [lens])]
     check_out(out, read, may_be_folder=not prints)
     if lens is not None:
@@ -232,7 +232,7 @@ def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> Non
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
         for frame in frames_of(name, answers.channels, every):
-            taken_with = _lens(lenses, name, frame.image, frame.orientation)
+            taken_with = _lens(lenses, said, frame.image, frame.orientation)
             entry = {"video": said, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
     except KeyboardInterrupt:

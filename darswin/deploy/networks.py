@@ -95,7 +95,7 @@ class Programs:
         if known.fields is not None:
             inputs = [leaves[k].detach().float() for k in known.fields]
         else:
-            count = max(len(one) for one in leaves if isinstance(one, Tensor))
+            count = max((len(one) for one in leaves if isinstance(one, Tensor)), default=1)
             each = [self._trace(_of_lens(read, k), shapes).given for k in range(count)]
             inputs = [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
         learned = [one for one in leaves if isinstance(one, Tensor) and one.requires_grad]

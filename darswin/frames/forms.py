@@ -115,6 +115,7 @@ def decode(
     return [_decoded(form, one, size, threshold) for one in each]
 
 
+@np.errstate(invalid="ignore", over="ignore")  # the caller tells of them
 def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: float) -> Detections:
     things, scores = len(found["boxes"]), found["scores"].astype(float)
     scores = scores[:, None] if scores.ndim == 1 else scores
@@ -123,7 +124,8 @@ def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: fl
         scores = (scores / scores.sum(-1, keepdims=True))[:, :-1]
     labels = found["labels"].reshape(things) if "labels" in found else scores.argmax(-1)
     score = scores.max(-1)
-    if "image" in found and (labels % 1).any():  # SuperGradients has the class after the score
+    # SuperGradients has the class after the score.
+    if "image" in found and ((labels % 1).any() or (score > 1).any()):
         labels, score = score, labels
     if form.scores == "sigmoid":
         score = 1 / (1 + np.exp(-score))

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from darswin.frames.forms import RGB, Detections, Form, decode
-from darswin.frames.recognise import SCORES, TASKS, form_of, names_of
+from darswin.frames.recognise import SCORES, TASKS, form_of, imgsz_of, names_of
 from darswin.utils.extras import lack
 from darswin.utils.files import check_is_file
 from darswin.utils.parameters import check, naming
@@ -47,7 +47,8 @@ class OnnxNetwork:
     Args:
         path: the ONNX file. A config.json of transformers beside it, or above its folder "onnx",
             says what its outputs do not.
-        size: (H, W) of the pictures. None means that of the graph, which must then have one.
+        size: (H, W) of the pictures. None means that of the graph, or else of the metadata of
+            Ultralytics, one of which must then have one.
         count: the usual number of pictures in a call. They are one batch if the network takes it.
         threshold: the lowest score of a detection. Others are left out.
         task: detect, pose, obb or segment, of a file of Ultralytics that lost its metadata.
@@ -58,6 +59,7 @@ class OnnxNetwork:
         ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
             no known form, or of several, or the size is missing or not that of the graph.
         FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
+        TypeError: in a call, the pictures are not those of `output`.
 
     Attributes:
         size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
@@ -84,6 +86,8 @@ class OnnxNetwork:
         self._metadata = self._read_metadata()
         self.names = names_of(self._metadata)
         own, batch = self._read_input()
+        if size is None and None in own:
+            size = imgsz_of(self._metadata)
         if size is None and None in own:
             text = f"missing `size`: {self.path} takes pictures of any size, so choose one"
             raise naming(ValueError(text), "size")
@@ -156,18 +160,22 @@ class OnnxNetwork:
         return True
 
     def __call__(self, pictures: np.ndarray) -> list[Detections] | dict[str, np.ndarray]:
-        if pictures.dtype == np.uint8:
+        is_uint8 = pictures.dtype == np.uint8
+        if self._is_seen and is_uint8 != (self.output == "uint8"):
+            wanted = "uint8" if self.output == "uint8" else "floating point, normalized"
+            raise TypeError(f"{self.path} takes pictures of {wanted}, got {pictures.dtype}")
+        if is_uint8:
             pictures = np.moveaxis(pictures.reshape(-1, *self.size, self.channels), -1, 1)
         pictures = pictures.reshape(-1, self.channels, *self.size)
         found: list[Any] = []
-        for start in range(0, len(pictures), self.batch):
+        for start in range(0, max(1, len(pictures)), self.batch):
             part = pictures[start : start + self.batch]
             spare = np.zeros((self.batch - len(part), *part.shape[1:]), part.dtype)
             found += self._run(np.concatenate((part, spare)))
-        found = found[: len(pictures)]
+        count = len(pictures)
         if isinstance(found[0], Detections):
-            return found
-        return {name: np.stack([each[name] for each in found]) for name in found[0]}
+            return found[:count]
+        return {name: np.stack([each[name] for each in found])[:count] for name in found[0]}
 
     def _run(self, pictures: np.ndarray) -> list[Any]:
         """What one batch (B, C, H, W) shows, for each picture: `Detections`, or its outputs."""

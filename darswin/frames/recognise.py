@@ -1,6 +1,7 @@
 """Which form the outputs of a detector have: by metadata, names, shapes and types."""
 
 import ast
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,7 @@ from darswin.frames.forms import Form, Outputs, Pixels, Size, Where, cells, grid
 from darswin.utils.parameters import check, naming
 
 TASKS = ("detect", "pose", "obb", "segment")  # of Ultralytics
+_PARTS = {"pose": ("points", "keypoints"), "obb": ("turn", "turned boxes")}
 SCORES = ("softmax", "sigmoid")
 _RT_DETR = "RT-DETR of Ultralytics"
 _PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
@@ -53,6 +55,10 @@ def form_of(
     outputs = {name: values for name, values in outputs.items() if values.ndim < 5}  # no raw heads
     form = _named(outputs) or _typed(outputs) or _pair(outputs, size)
     form = form or _table(outputs, size, own or "", metadata)
+    part, found = _PARTS.get(str(task), ("boxes", "boxes"))
+    if form is not None and part not in form.where:
+        text = f"`task` is {task}, but the form {form.name!r} has no {found}"
+        raise naming(ValueError(text), "task")
     if form is not None and form.scores == "?":
         kind = _MODELS.get(scores or str(metadata.get("model_type")))
         if kind is None:
@@ -62,7 +68,21 @@ def form_of(
     if scores is not None:
         text = "`scores` is for the logits of transformers, so leave it out"
         raise naming(ValueError(text), "scores")
+    if form is not None and form.overlaps:
+        _check_scores(form, outputs)
     return form
+
+
+def _check_scores(form: Form, outputs: Outputs) -> None:
+    """ValueError for scores that are no probabilities, of a form whose scores are some."""
+    for name, columns in (form.where[key] for key in ("scores", "objectness") if key in form.where):
+        values = outputs[name].swapaxes(1, 2) if form.things_last else outputs[name]
+        low, high = values[..., columns].min(), values[..., columns].max()
+        if low < -0.01 or high > 1.01:
+            raise ValueError(
+                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
+                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
+            )
 
 
 def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
@@ -74,6 +94,12 @@ def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
         return {int(number): str(name) for number, name in pairs}
     except (ValueError, TypeError, SyntaxError):
         return {}
+
+
+def imgsz_of(metadata: Mapping[str, Any]) -> tuple[int, int] | None:
+    """The (H, W) in the metadata of Ultralytics, which graphs of any size have too."""
+    found = re.fullmatch(r"\[(\d+), (\d+)\]", str(metadata.get("imgsz")))
+    return (int(found[1]), int(found[2])) if found else None
 
 
 def _question(word: str, found: str, instead: str) -> ValueError:
@@ -145,7 +171,10 @@ def _pair(outputs: Outputs, size: Size) -> Form | None:
     if width == 5 or flat[other][:-1] != (*things,):
         return None
     if things[1] in grids(size):
-        return Form("YOLO-NAS", where, overlaps=True)
+        corners, scores = outputs[boxes], outputs[other]
+        share = (corners[..., :2] <= corners[..., 2:]).all(-1).mean()
+        are_read = share > 0.9 and scores.min() >= 0 and scores.max() <= 1
+        return Form("YOLO-NAS", where, overlaps=True) if are_read else None
     if boxes == "dets":
         return Form("RF-DETR", where, "middle", True, "sigmoid", pixels=_IMAGENET)
     return Form("transformers", where, "middle", True, "?")

@@ -59,11 +59,10 @@ def detections_to_images(
         share of the area of each ellipse that the image shows, and boxes that it does not show are
         left out. "rays" (K, 3) are the directions of the middles of the boxes of the view, in the
         camera's frame, unless the view ignores the lens. Masks are resampled to the
-        image. Keypoints that the image does not show are NaN.
+        image, those of tiles too. Keypoints that the image does not show are NaN.
 
     Raises:
-        ValueError: boxes, scores and labels do not fit together, the view is polar, or there are
-            masks of tiles.
+        ValueError: boxes, scores and labels do not fit together, or the view is polar.
     """
     if not isinstance(view, PixelView):
         raise ValueError("boxes cannot come back from a polar image: choose another view")
@@ -74,30 +73,31 @@ def detections_to_images(
         remap = prepared.remaps[min(k, len(prepared.remaps) - 1)]
         tiles = found[k * view.count : (k + 1) * view.count]
         carried = [_carried(part, tile) for part, tile in zip(tiles, remap.tiles, strict=True)]
-        joined = {name: torch.cat([part[name] for part in carried]) for name in carried[0]}
-        if "masks" in joined:
-            joined["masks"] = _masks_in_image(joined["masks"], view, prepared.view, k)
+        of_all = [name for name in carried[0] if all(name in part for part in carried)]
+        joined = {name: torch.cat([part[name] for part in carried]) for name in of_all}
+        counts = [len(part["boxes"]) for part in carried]
+        sources = torch.arange(view.count).repeat_interleave(torch.tensor(counts))
+        joined["sources"] = sources.to(joined["boxes"].device)
         seen = joined["visible"] > 0
         joined = {name: value[seen] for name, value in joined.items()}
         if view.count > 1:
             kept = of_boxes.merge(*(joined[name] for name in NAMES))
             joined = {name: value[kept] for name, value in joined.items()}
+        sources = joined.pop("sources")
+        if "masks" in joined:
+            joined["masks"] = _masks_in_image(joined["masks"], sources, remap)
         results.append(joined)
     return results
 
 
-def _masks_in_image(masks: Tensor, view: View, prepared: Any, image: int) -> Tensor:
-    """Masks (K, 1, H', W') of one picture in the pixels of its image, (K, 1, H, W)."""
-    if view.count > 1:
-        raise ValueError("masks of tiles cannot come back: choose a view of one picture")
-    if prepared.back is not None:
-        number, around = min(image, len(prepared.back) - 1), prepared.around
-        if around is not None and len(around) > 1:
-            around = around[number : number + 1]
-        prepared = prepared._replace(back=prepared.back[number : number + 1], around=around)
-    height, width = prepared.size
-    in_image = view.back(masks.reshape(1, -1, *masks.shape[-2:]), prepared)
-    return in_image.view(*masks.shape[:-2], height, width)
+def _masks_in_image(masks: Tensor, sources: Tensor, remap: Remap) -> Tensor:
+    """Masks (K, 1, H', W') of the tiles `sources` (K,) in the pixels of the image, (K, 1, H, W)."""
+    in_image = masks.new_zeros(*masks.shape[:-2], *remap.size)
+    for number in sources.unique().tolist():
+        mine = sources == number
+        maps = masks[mine].reshape(1, -1, *masks.shape[-2:]).cpu()
+        in_image[mine] = remap.tiles[number].back(maps).view_as(in_image[mine]).to(masks)
+    return in_image
 
 
 def _carried(found: Mapping[str, Tensor], remap: Remap) -> dict[str, Tensor]:

@@ -83,7 +83,7 @@ def is_stream(path: str | Path) -> bool:
 
 def stream_name(path: str) -> str:
     """A stream in words: its address without user and password."""
-    return re.sub(r"//[^/@]*@", "//", path)
+    return re.sub(r"://[^/?#]*@", "://", path)
 
 
 def read_stream(path: str, channels: int = 3, every: int = 1) -> Iterator[Frame]:
@@ -104,15 +104,18 @@ def read_stream(path: str, channels: int = 3, every: int = 1) -> Iterator[Frame]
 
     def watch() -> None:
         nonlocal newest, ended
-        while not left:
-            there, image = capture.read()
-            with changed:
-                ended = not there
-                if there:
+        try:
+            while not left:
+                there, image = capture.read()
+                if not there:
+                    break
+                with changed:
                     newest = newest[0] + 1, clock.monotonic() - start, image
+                    changed.notify()
+        finally:
+            with changed:
+                ended = True
                 changed.notify()
-            if not there:
-                break
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

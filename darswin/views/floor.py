@@ -19,6 +19,7 @@ _TURN = np.linspace(0, 2 * np.pi, 36, endpoint=False)
 _CIRCLE = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
 
 
+@np.errstate(invalid="ignore")  # boxes may end nowhere
 def on_floor(remap: Any, boxes: Any, height: float, up: Vector, radius: float) -> Any:
     """`Remap.floor`."""
     above = check_floor(remap.view, height, up, radius)

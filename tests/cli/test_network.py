@@ -15,7 +15,8 @@ pytest.importorskip("onnxruntime")
 
 from graphs import write_constants, write_detector, write_graph
 
-from darswin.boxes import decode_rle
+from darswin.boxes import decode_rle, encode_rle
+from darswin.cli.found import yolo_lines
 from darswin.cli.main import main
 from darswin.cli.network import NetworkAnswers
 from darswin.lens import Equidistant
@@ -352,6 +353,11 @@ def test_a_stream_ends_by_ctrl_c_with_its_predictions(tmp_path, monkeypatch, cap
         assert entry["overlay"] == f"overlays/rtsp_host_door/{entry['frame']:06}.jpg"
         assert (tmp_path / "out" / entry["overlay"]).is_file()
     assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
+    for given in (json.dumps(lens_of("Equidistant") | {"image_size": [9, 9]}), str(tmp_path)):
+        command = ["predict", *argv, "--lens", given, "--out", tmp_path / "out"]
+        with pytest.raises(SystemExit, match=r"for 9×9|no calibration in") as error:
+            main([str(word) for word in command])
+        assert "secret" not in str(error.value)
     assert "secret" not in capsys.readouterr().err
 
 
@@ -660,6 +666,46 @@ def test_turned_boxes_come_back(tmp_path, view, size, format):
             np.testing.assert_allclose(points.mean(0), (u, v), atol=0.01)
             np.testing.assert_allclose(ahead, [w * np.cos(angle), w * np.sin(angle)], atol=0.01)
             assert (names[label], round(score, 4)) == (given["label"], given["score"])
+
+
+def test_each_picture_has_an_id_of_its_own_in_coco(tmp_path):
+    """Their names are no ids if two have one number; and an old file is replaced by nothing."""
+    rows = np.array([[[10, 10, 30, 30, 0.5, 1]]], np.float32)
+    network = write_constants(tmp_path / "n.onnx", (64, 64), found=rows)
+    lens = {"model": "Equidistant", "focal": 24.0, "theta_max": 1.2}
+    for name in ("in/a/7.png", "in/b/8.png", "in/b/c.png", "more/b/07.png"):
+        write_picture(tmp_path / name, np.zeros((64, 80, 3), np.uint8))
+    write_frames(tmp_path / "in/v.mp4", np.zeros((2, 64, 80, 3), np.uint8), 10)
+    folders, frames = [tmp_path / "in", tmp_path / "more"], ["v.mp4/000000", "v.mp4/000001"]
+    names = [f"in/{name}" for name in ("a/7", "b/8", "b/c", *frames)]
+    for paths, threshold, ids in (
+        (folders[:1], "0.1", [7, 8, "b/c", *frames]),
+        (folders, "0.1", [*names, "more/b/07"]),
+        (folders, "0.9", []),
+    ):
+        argv = [*paths, "--network", network, "--format", "coco", "--threshold", threshold]
+        predict(*argv, out=tmp_path / "out", lens=lens)
+        results = json.loads((tmp_path / "out/coco.json").read_text())
+        assert [one["image_id"] for one in results] == ids
+
+
+def test_a_mask_of_few_pixels_is_a_box_in_yolo():
+    """Two points would read as a box."""
+    mask = np.zeros((10, 20), bool)
+    mask[4, 6:8] = True
+    found = dict(
+        boxes=np.array([[5.0, 4, 9, 6]]), scores=[0.5], labels=[3], masks=[encode_rle(mask)]
+    )
+    assert yolo_lines((10, 20), found) == "3 0.35 0.5 0.2 0.2 0.5\n"
+
+
+def test_infinity_is_null_in_json(tmp_path):
+    points = np.array([[[[32, 32, np.inf], [np.inf, 32, 0.5]]]], np.float32)
+    (one,) = run_constants(
+        tmp_path, view="mercator", boxes=np.array([[[20, 20, 40, 40]]], np.float32),
+        scores=np.array([[0.9]], np.float32), labels=np.array([[1]]), keypoints=points,
+    )["detections"]  # fmt: skip
+    assert one["keypoints"][0][2] is None and one["keypoints"][1] == [None, None, 0.5]
 
 
 def test_boxes_that_overlap_are_merged_and_words_answer_questions(tmp_path, capsys):

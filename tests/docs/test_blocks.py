@@ -206,9 +206,28 @@ def check_frame(arguments: list[str], monkeypatch) -> None:
     assert frames.Network(network)(cv2.imread(picture)[..., ::-1]).ndim == 1
 
 
+def write_stand_in(file: str) -> None:
+    """The stand-in of the tutorial, in place of the detector that its program would fetch."""
+    page, scope = blocks(ROOT / "docs/tutorials/detector.md"), {}
+    (text,) = (block.text for block in page if "class StandIn" in block.text)
+    run_python(text, scope)
+    torch.onnx.export(
+        scope["StandIn"]().eval(), (torch.zeros(1, 3, 512, 512),), file, input_names=["images"],
+        output_names=["boxes", "scores", "labels"], external_data=False,
+    )  # fmt: skip
+
+
+def check_opens(arguments: list[str], monkeypatch) -> None:
+    """The page has written what its reader is to look at."""
+    assert cv2.imread(*arguments) is not None
+
+
 def run_program(arguments: list[str], monkeypatch) -> None:
     """Runs the program that the page names, on a few pictures or on a video of the camera."""
     program = arguments[0]
+    if program == "studies/pretrained_detector.py":
+        write_stand_in(arguments[1])
+        return
     if program in ("studies/study.py", "studies/dense.py"):
         check_study(arguments, monkeypatch)
         return
@@ -229,6 +248,7 @@ PROGRAMS: dict[str, Callable] = {
     "make": check_make,
     "pip": check_pip,
     "python": run_program,
+    "xdg-open": check_opens,
 }
 
 
@@ -249,17 +269,17 @@ def test_a_detector_finds_the_same_with_torch_and_without_and_by_the_command(scr
             run_python(block.text, scope)
         else:
             (command,) = commands(block.text)
-            run_darswin(command[1:], monkeypatch)
-    with_torch = scope["found"]["boxes"][scope["found"]["scores"] > 0.7]
+            PROGRAMS[command[0]](command[1:], monkeypatch)
+    with_torch = scope["found"]["boxes"][scope["found"]["scores"] > 0.3]
     alone = scope["there"][scope["best"]]
     (entry,) = json.loads(Path("found/predictions.json").read_text())
     by_command = [found["box"] for found in entry["detections"]]
     assert len(by_command) > 3 and entry["detections"][0]["score"] > 0.5
-    # At the border of the picture, a plan ends where the last point of a box is in it.
+    # At the border of what the lens sees, a plan ends where the last point of a box is in it.
     np.testing.assert_allclose(alone, with_torch, atol=1.5)
-    np.testing.assert_allclose(by_command, alone, atol=0.02)
+    np.testing.assert_allclose(by_command, with_torch, atol=0.02)
     drawn = [cv2.imread(name) for name in ("found.jpg", "without_torch.jpg")]
-    assert all(np.abs(one - cv2.imread("examples/room.jpg")).max() > 100 for one in drawn)
+    assert all(np.abs(one - cv2.imread("examples/parking.jpg")).max() > 100 for one in drawn)
 
 
 @pytest.mark.slow

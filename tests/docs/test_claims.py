@@ -151,6 +151,20 @@ def mean_precision(of: str, table: str = "CenterNet, level", key: str = "map") -
     return f"{detected(of, table, key):.2f}".removeprefix("0")
 
 
+def sliced(of: str, split: str = "level") -> str:
+    """The mAP of a method in the comparison with slices."""
+    return f"{record('pretrained')['slices'][split]['methods'][of]['map']:.2f}".removeprefix("0")
+
+
+def gain(first: str, second: str, split: str = "level", key: str = "map") -> str:
+    """The difference of two methods there, with its interval."""
+    pairs = record("pretrained")["slices"][split]["pairs"]
+    (of,) = (of for of in pairs if (of["first"], of["second"]) == (first, second))
+    value, *ends = (f"{v:.2f}".replace("-0.00", "0.00").replace("0.", ".").replace("-", "−")
+                    for v in (of[key], *of[f"{key}_interval"]))  # fmt: skip
+    return f"{'+' if of[key] >= 0.005 else ''}{value} [{ends[0]}, {ends[1]}]"
+
+
 def front_page() -> list[str]:
     """What the README says of Fashion-MNIST, of dense tasks, and of when not to use darswin."""
     labels = "DarSwin-A", "Swin", augmented_label("DarSwin-A"), augmented_label("Swin")
@@ -214,6 +228,52 @@ def results_of_detectors() -> list[str]:
     ]
 
 
+SLICES, ENLARGED = "slices: 4, and raw", "slices: 9 of 410²"
+LARGE_RAW, WRONG = "raw, 1024²", "tiles: 5, wrong lens"
+
+
+def results_of_slices() -> list[str]:
+    ring = "ring of 6 tiles"
+    return [
+        f"Four tiles have {sliced('tiles: 4')} mAP and four slices {sliced('slices: 4')} "
+        f"({gain('tiles: 4', 'slices: 4')}); nine tiles have {sliced('tiles: 9')} and nine slices "
+        f"{sliced('slices: 9')} ({gain('tiles: 9', 'slices: 9')}).",
+        f"Five tiles have {sliced('tiles: 5')} mAP, and four slices with the whole picture, sahi's "
+        f"way, {sliced(SLICES)}: {gain('tiles: 5', SLICES)}, and "
+        f"{gain('tiles: 5', SLICES, key='recall')} in recall.",
+        f"better five runs: {gain('tiles: 4, and mercator', SLICES)}.",
+        f"{sliced(SLICES)} against {sliced('mercator')}, with five runs",
+        f"five tiles have {sliced('tiles: 5', 'small')} mAP, four slices with the whole "
+        f"{sliced(SLICES, 'small')}.",
+        f"have {sliced(ENLARGED, 'small')} against {sliced('tiles: 9', 'small')} of nine tiles: "
+        f"{gain('tiles: 9', ENLARGED, 'small')}, not shown.",
+        f"Five tiles have {sliced('tiles: 5', 'down')} mAP, six in a ring {sliced(ring, 'down')}, "
+        f"and four slices with the whole {sliced(SLICES, 'down')}: "
+        f"{gain('tiles: 5', SLICES, 'down')} and {gain(ring, SLICES, 'down')}. Nine slices have "
+        f"{sliced('slices: 9', 'down')}, less than one panorama, {sliced('panorama', 'down')}.",
+        f"{gain(SLICES, LARGE_RAW)} for level pictures, {gain(SLICES, LARGE_RAW, 'small')} for "
+        f"small things and {gain(SLICES, LARGE_RAW, 'down')} down.",
+        f"{gain(SLICES, LARGE_RAW, key='recall')} level and "
+        f"{gain(SLICES, LARGE_RAW, 'down', 'recall')} down.",
+        f"Slices have {gain(SLICES, WRONG)} mAP over five tiles by a wrong lens, and the picture "
+        f"at 1024² has {gain(LARGE_RAW, WRONG)}.",
+        f"these are {gain(SLICES, WRONG, 'small')} and {gain(SLICES, WRONG, 'down')} for slices, "
+        f"and {gain(LARGE_RAW, WRONG, 'small')} and {gain(LARGE_RAW, WRONG, 'down')} for",
+    ]
+
+
+def answer_without_a_lens() -> list[str]:
+    level, down = (
+        [sliced(of, split) for of in (SLICES, LARGE_RAW, WRONG, "tiles: 5")]
+        for split in ("level", "down")
+    )
+    return [
+        f"have {level[0]} mAP, the picture at 1024² {level[1]}, and five tiles by a wrong lens "
+        f"{level[2]}. With the true lens, five tiles have {level[3]}.",
+        f"these are {down[0]}, {down[1]}, {down[2]} and {down[3]}.",
+    ]
+
+
 def table_of_views() -> list[str]:
     map_of = mean_precision
     large = {view: map_of(f"{view}, 1024²") for view in ("raw", "stereographic", "mercator")}
@@ -238,6 +298,8 @@ def table_of_views() -> list[str]:
     [
         ("README.md", front_page),
         ("docs/study_pretrained.md", results_of_detectors),
+        ("docs/study_pretrained.md", results_of_slices),
+        ("docs/answers.md", answer_without_a_lens),
         ("docs/explanation/views.md", table_of_views),
     ],
 )

@@ -145,7 +145,7 @@ class _Constant(nn.Module):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("name", "kind"), product(sorted(set(VIEWS) - {"tiles"}), LENSES))
+@pytest.mark.parametrize(("name", "kind"), product(VIEWS, LENSES))
 def test_masks_and_keypoints_come_back_with_the_boxes(name, kind):
     lens = LENSES[kind]
     images, exact = disks(lens)
@@ -153,11 +153,12 @@ def test_masks_and_keypoints_come_back_with_the_boxes(name, kind):
 
     class Segments(Disks):
         def forward(self, x):
-            (found,) = super().forward(x)
-            found["masks"] = x[0, found["labels"], None].clamp(0, 1)
-            middles = found["boxes"].unflatten(1, (2, 2)).mean(1)
-            found["keypoints"] = torch.cat((middles, torch.ones(len(middles), 1)), 1)[:, None]
-            return [found]
+            each = super().forward(x)
+            for picture, found in zip(x, each, strict=True):
+                found["masks"] = picture[found["labels"], None].clamp(0, 1)
+                middles = found["boxes"].unflatten(1, (2, 2)).mean(1)
+                found["keypoints"] = torch.cat((middles, torch.ones(len(middles), 1)), 1)[:, None]
+            return each
 
     (found,) = LensAdapter(Segments("list"), view=view)(images, lens)
     assert found["masks"].shape == (len(found["labels"]), 1, *SIZE)
@@ -212,9 +213,6 @@ def test_detections_that_do_not_fit_are_refused():
     for wrong in (network.found_dict()["boxes"], {"boxes": np.zeros((1, 4))}, [1, 2]):
         with pytest.raises(TypeError, match="boxes must return a dict of tensors boxes, scores"):
             LensAdapter(network, 64, view="tiles", boxes=lambda _, w=wrong: w)(images, lens)
-    masks = dict(network.found_dict(), masks=torch.zeros(1, 1, 64, 64))
-    with pytest.raises(ValueError, match="masks of tiles cannot come back"):
-        LensAdapter(network, 64, view="tiles", boxes=lambda _: [masks] * 5)(images, lens)
     with pytest.raises(ValueError, match="a polar image"):
         LensAdapter(network, 64, view="polar")(images, lens)
 
@@ -236,6 +234,10 @@ def test_odd_boxes_of_networks(name):
     batched = {k: v[None].expand(tiles, *v.shape) if v.dim() else v for k, v in out.items()}
     (same,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: batched)(images, lens)
     assert torch.equal(same["boxes"], found["boxes"])
+    empty = {name: value[:0] if value.dim() else value for name, value in out.items()}
+    some = [dict(out, number=torch.tensor([3])), *[dict(empty, number=torch.tensor([3]))] * 4]
+    (one,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: some[:tiles])(images, lens)
+    assert len(one["boxes"]) == 1
     none = dict(out, boxes=torch.full((1, 4), math.nan))
     (empty,) = LensAdapter(nn.Identity(), view=view, boxes=lambda _: [none] * tiles)(images, lens)
     assert empty["boxes"].shape == (0, 4)

@@ -135,16 +135,16 @@ def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3, groups=0):
     return nn.ModuleList(blocks).requires_grad_(False).eval()
 
 
-every_stage = pytest.mark.parametrize(
-    "sizes",
-    [
-        {}, dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)), dict(dim=64, heads=2, depth=1),
-        dict(groups=3), dict(dim=40, heads=4, map_size=(6, 9), window=(3, 3), groups=2),
-        dict(dim=10, heads=2, map_size=(1, 6), window=(1, 3), groups=1),
-        dict(dim=3, heads=1, map_size=(1, 1), window=(1, 1), groups=1),
-    ],
-    ids=str,
-)  # fmt: skip
+WINDOWS = [
+    {},
+    dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)),
+    dict(dim=64, heads=2, depth=1),
+]
+DEFORMABLE = [
+    dict(groups=3), dict(dim=40, heads=4, map_size=(6, 9), window=(3, 3), groups=2),
+    dict(dim=10, heads=2, map_size=(1, 6), window=(1, 3), groups=1),
+    dict(dim=3, heads=1, map_size=(1, 1), window=(1, 1), groups=1),
+]  # fmt: skip
 
 
 def run(blocks, x):
@@ -154,7 +154,7 @@ def run(blocks, x):
 
 
 @pytest.mark.parametrize("batch", [0, 1, 3])
-@every_stage
+@pytest.mark.parametrize("sizes", [*WINDOWS, *DEFORMABLE], ids=str)
 def test_blocks_are_those_of_the_layers(batch, sizes):
     blocks = stage(**sizes)
     map_size, dim = blocks[0].attn.map_size, blocks[0].attn.dim

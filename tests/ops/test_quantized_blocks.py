@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
 from hypothesis import example, given
 from hypothesis import strategies as st
-from test_blocks import every_stage, stage
+from test_blocks import WINDOWS, stage
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import OneDNN, Own
@@ -132,7 +132,7 @@ def step_by_step(blocks, tables, x):
 
 @pytest.mark.parametrize("batch", [0, 1, 3])
 @pytest.mark.parametrize("names", [LAYERS, LAYERS[:1], LAYERS[1:2], LAYERS[2:], ("mlp.fc2",)])
-@every_stage
+@pytest.mark.parametrize("sizes", WINDOWS, ids=str)
 def test_blocks_are_those_of_the_layers(batch, names, sizes):
     blocks, tables = quantized_stage(names, **sizes)
     x = torch.randn(batch, *blocks[0].attn.map_size, blocks[0].attn.dim)

@@ -132,6 +132,18 @@ def test_a_camera_that_is_left_is_released(monkeypatch):
     assert Camera.latest.released and Camera.latest.source == "/dev/video0"
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_camera_that_fails_ends(monkeypatch):
+    def read(self):
+        if self.count == 2:
+            raise video.cv2.error("broken")
+        return Camera.read(self)
+
+    monkeypatch.setattr(video.cv2, "VideoCapture", type("Failing", (Camera,), {"read": read}))
+    assert [frame.number for frame in video.read_stream("0")][-1] <= 2
+    assert Camera.latest.released
+
+
 def test_streams_and_what_is_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "1").mkdir()
@@ -140,6 +152,7 @@ def test_streams_and_what_is_none(tmp_path, monkeypatch):
     assert all(map(video.is_stream, streams))
     assert not any(map(video.is_stream, ["1", "2", "a.mp4", "C:/a.mp4", "/dev/null", "1234", "-1"]))
     assert video.stream_name(streams[2]) == "rtsp://host:554/a"
+    assert video.stream_name("rtsp://u:p@:s@host/a@b//c@d") == "rtsp://host/a@b//c@d"
     monkeypatch.setattr(video.cv2, "VideoCapture", type("Closed", (Camera,), {"opened": False}))
     with pytest.raises(BrokenImageError, match="cannot read rtsp://host:554/a: OpenCV opens no"):
         next(video.read_stream(streams[2]))

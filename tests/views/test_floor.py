@@ -129,6 +129,7 @@ def test_a_camera_that_looks_down_has_the_top_of_its_picture_ahead():
         assert ahead == pytest.approx(2, abs=0.4) and abs(right) < 0.4
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("view", ["mercator", "tiles"])
 def test_what_does_not_meet_the_floor_is_nan(view):
     tile = remap_of(view, (0, -1, 0)).tiles[0]
@@ -141,9 +142,11 @@ def test_what_does_not_meet_the_floor_is_nan(view):
         [*middle, height],  # cut
         [*middle, height + 5],
         [np.nan] * 4,
+        [-np.inf, *middle[1:], height / 2 + 30],
+        [-np.inf, middle[1], np.inf, height / 2 + 30],
     ])  # fmt: skip
     found = tile.floor(box, 1.5, (0, -1, 0))
-    assert np.isnan(found).all(1).tolist() == [True, True, False, True, True, True]
+    assert np.isnan(found).all(1).tolist() == [True] * 2 + [False] + [True] * 5
     assert tile.floor(np.zeros((0, 4)), 1.5, (0, -1, 0)).shape == (0, 2)
     same = tile.floor(torch.from_numpy(box).float(), 1.5, torch.tensor([0.0, -2, 0]))
     assert same.dtype == torch.float32
