@@ -25,7 +25,7 @@ MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # Stages of a refinement: the part of the corners whose largest distance gives the scale; this
 # distance in standard deviations; the smallest gain of a round. ROUGH follows the worst corners.
 # AGAIN starts where FINE has ended, with a part of the pictures.
-ROUGH, FINE, AGAIN = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5), (0.5, MEDIAN, 1e-4)
+ROUGH, FINE, AGAIN = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5), (0.5, MEDIAN, 1e-3)
 # The shape of a board, by which its points (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
 BEND, STRETCH = ("bend[0]", "bend[1]"), ("stretch",)
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.

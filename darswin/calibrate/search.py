@@ -125,11 +125,12 @@ def calibrate(
     found.sort(key=lambda one: one.left_out)
     taken = [one for one in found if accept is None or accept(one.state.lens)] or found
     close = [one for one in taken if not one.left_out > CLOSE * taken[0].left_out][:FINALISTS]
-    for one in close:
+    for k, one in enumerate(close):
         say(f"Leaving out pictures: {one.free.model.__name__}")
-        other = one.leave_out(views, counts).with_more(views, counts, square_pixels)
+        other = one.with_more(views, counts, square_pixels)
         if accept is None or not accept(one.state.lens) or accept(other.state.lens):
-            found[found.index(one)] = close[close.index(one)] = other
+            found[found.index(one)] = close[k] = other
+        close[k].leave_out(views, counts)
     best = _simplest(close)
     found.sort(key=lambda one: (one is not best, one.left_out))
     table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
@@ -211,7 +212,7 @@ class _Found:
             moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
             self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
 
-    def leave_out(self, views: Views, counts: Tensor) -> "_Found":
+    def leave_out(self, views: Views, counts: Tensor) -> None:
         """Computes `squares` (P,), the sums of the squared misses in each picture of a lens that
         was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
         pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
@@ -236,11 +237,10 @@ class _Found:
                 miss = mine.miss(state).square().sum(-1)
                 self.squares[part] = torch.where(counts[part], miss, 0.0).sum(1)
         self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
-        return self
 
     def with_more(self, views: Views, counts: Tensor, square_pixels: bool | None) -> "_Found":
         """The same with the ratio of a pixel's sides and the shape of the board, as far as they
-        are significant, if they predict left-out pictures better."""
+        are significant, if they predict left-out pictures better, to first order."""
         names, confounded = self._significant(views, counts, square_pixels is None)
         if not names:
             return self
@@ -253,7 +253,6 @@ class _Found:
         other = _Found(free, state, scale, views, self.used)
         other.judge(views, counts)
         other.confounded = confounded and STRETCH[0] in names
-        other.leave_out(views, counts)
         return other if other.left_out < self.left_out else self
 
     def _significant(self, views: Views, counts: Tensor, pixels: bool) -> tuple[list[str], bool]:
