@@ -1,8 +1,8 @@
 """Runs the calibration study: lenses found from corners of boards, by us and by others.
 
 Each set of corners goes to each method, and the rays that a method finds are compared with the
-truth: see `calibrate_rays.py`. Then the chessboards of Debian's package `opencv-doc` are
-calibrated: see `calibrate_real.py`. `calibrate_tables.py` makes the tables and the figure. Run it
+truth: see `calibrate_rays.py`. Then real chessboards are calibrated, as far as their pictures are
+there: see `calibrate_real.py`. `calibrate_tables.py` makes the tables and the figure. Run it
 with `make study-calibrate`. It takes about 15 minutes of one core; with `--quick`, a minute.
 
 Each set is a cell with a file under `--out`, so a study that was stopped can go on. mrcal (`apt-get
@@ -17,15 +17,13 @@ import resource
 from pathlib import Path
 
 import numpy as np
-from calibrate_peers import METHODS, versions
+from calibrate_peers import METHODS, NEEDS, versions
 from calibrate_rays import QUICK, Set, all_sets, make, ray_errors
-from calibrate_real import DATA, real_cameras
+from calibrate_real import SETS, files_of, real_set
 from calibrate_tables import publish
 from jobs import key_of, run_all
 
 from darswin.utils.files import replace_file
-
-NEEDS = {"cv2.omnidir": "opencv-contrib", "mrcal, OPENCV8": "mrcal", "mrcal, splined": "mrcal"}
 
 
 def seconds() -> float:
@@ -45,7 +43,7 @@ def run_set(which: Set, seed: int, tools: dict[str, str]) -> dict:
             continue
         start = seconds()
         try:
-            off = ray_errors(method(given), true)
+            off = ray_errors(method(given).rays, true)
             found = dict(median=float(np.median(off)), most=float(np.quantile(off, 0.95)))
         except Exception as error:  # of any tool: it is a result
             found = dict(failed=f"{type(error).__name__}: {error}")
@@ -58,7 +56,7 @@ def run_cell(file: Path, work: str, *arguments: object) -> dict:
     if file.exists():
         return json.loads(file.read_text())
     start = seconds()
-    result = {"set": run_set, "real": real_cameras}[work](*arguments)
+    result = {"set": run_set, "real": real_set}[work](*arguments)
     cell = {work: result, "seconds": round(seconds() - start, 1)}
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_file(file, json.dumps(cell, indent=1, allow_nan=False))
@@ -75,7 +73,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--collect", action="store_true", help="runs nothing and collects existing results"
     )
-    parser.add_argument("--data", type=Path, default=DATA, help="the folder with left01.jpg …")
+    parser.add_argument(
+        "--data", type=Path, default=Path("out") / "boards",
+        help="the folder with clones of the repositories with real boards",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("out") / "calibrate")
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results")
     args = parser.parse_args(arguments)
@@ -85,8 +86,9 @@ def main(arguments: list[str] | None = None) -> None:
     for seed, which in enumerate(QUICK if args.quick else all_sets()):
         key = key_of(f"{seed:03} {which.model} {which.fov} {which.pictures} {which.noise}")
         jobs.append((args.out / f"{key}.json", "set", which, seed, tools))
-    if args.data.is_dir():
-        jobs.append((args.out / "real.json", "real", args.data, not args.quick))
+    for name, boards in {} if args.quick else SETS.items():
+        if files := files_of(boards, args.data):
+            jobs.append((args.out / f"{key_of(name)}.json", "real", name, files, tools))
     jobs = [job for job in jobs if args.cell in job[0].stem]
     if args.collect:
         jobs = [job for job in jobs if job[0].exists()]
@@ -94,7 +96,7 @@ def main(arguments: list[str] | None = None) -> None:
     sets = sorted((cell["set"] for cell in cells if "set" in cell), key=lambda of: of["seed"])
     record = dict(
         versions=tools, core_minutes=round(sum(cell["seconds"] for cell in cells) / 60, 1),
-        sets=sets, real=[camera for cell in cells for camera in cell.get("real", [])],
+        sets=sets, real=[cell["real"] for cell in cells if "real" in cell],
     )  # fmt: skip
     publish(record, args.results)
 

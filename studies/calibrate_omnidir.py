@@ -14,8 +14,9 @@ import numpy as np
 def main() -> None:
     given, found = sys.argv[1:]
     data = np.load(given)
-    points = [data["points"][None]] * len(data["corners"])
-    corners = [picture[None] for picture in data["corners"]]
+    seen = ~np.isnan(data["corners"]).any(2)
+    points = [data["points"][None, there] for there in seen]
+    corners = [picture[None, there] for picture, there in zip(data["corners"], seen, strict=True)]
     height, width = (int(side) for side in data["size"])
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 500, 1e-10)
     try:

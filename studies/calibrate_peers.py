@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,11 +30,11 @@ class FailedError(Exception):
 
 @dataclass
 class Given:
-    """What a method is given: corners (P, K, 2) px of a flat board (K, 3), rows of `columns`
-    corners, in pictures of size (H, W); the angles (P, K) of the corners, degrees, by which a
-    method may leave out pictures; the field of view, degrees, and a focal length, px, near the
-    axis, for methods that need a guess; the true model, which one method is told; and the pixels
-    (M, 2) whose rays are asked."""
+    """What a method is given: corners (P, K, 2) px, NaN where not seen, of a board (K, 3), rows of
+    `columns` corners, in pictures of size (H, W); the angles (P, K) of the corners, degrees, by
+    which a method may leave out pictures; the field of view, degrees, and a focal length, px, near
+    the axis, for methods that need a guess; the true model, which one method is told; the pixels
+    (M, 2) whose rays are asked; and whether the board is known to be flat."""
 
     corners: np.ndarray
     board: np.ndarray
@@ -44,24 +45,46 @@ class Given:
     focal: float
     model: str
     pixels: np.ndarray
+    flat: bool = True
 
     def within(self, degrees: float) -> np.ndarray:
         """The corners of the pictures that show none beyond an angle from the axis."""
-        kept = self.corners[(self.angles <= degrees).all(1)]
+        kept = self.corners[~(self.angles > degrees).any(1)]
         if len(kept) < LEAST:
             raise FailedError(f"only {len(kept)} pictures lie within {degrees:.0f}°")
         return kept
 
 
-def ours(model: str | None) -> Callable[[Given], np.ndarray]:
+class Found(NamedTuple):
+    """What a method finds: rays (M, 3) at the pixels; the board (K, 3), if it bends it; and the
+    model that it chose."""
+
+    rays: np.ndarray
+    board: np.ndarray | None = None
+    model: str = ""
+
+
+Method = Callable[[Given], Found]
+
+
+def _seen(corners: np.ndarray, board: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The points and the corners of each picture that are seen."""
+    seen = ~np.isnan(corners).any(2)
+    return [board[there] for there in seen], [
+        c[there] for c, there in zip(corners, seen, strict=True)
+    ]
+
+
+def ours(model: str | None) -> Method:
     """`calibrate` with a model, or with that of the true lens."""
 
-    def method(given: Given) -> np.ndarray:
+    def method(given: Given) -> Found:
         try:
             found = calibrate(given.corners, given.board[:, :2], given.size, model or given.model)
         except CalibrationError as error:
             raise FailedError(str(error)) from None
-        return _rays(found.lens, given.pixels)
+        lens = found.lens
+        return Found(_rays(lens, given.pixels), found.board.numpy(), type(lens).__name__)
 
     return method
 
@@ -94,13 +117,13 @@ def lens_of_brown(matrix: np.ndarray, d: np.ndarray, size: tuple[int, int]) -> L
     return _of_opencv(BrownConrady, matrix, size, **terms)
 
 
-def pinhole(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
+def pinhole(flags: int, limit: float) -> Method:
     """`cv2.calibrateCamera` with the pictures that show nothing beyond `limit`, degrees."""
 
-    def method(given: Given) -> np.ndarray:
+    def method(given: Given) -> Found:
         corners = given.within(limit)
         found = brown(corners, given.board, given.size, flags)
-        return _rays(lens_of_brown(*found, given.size), given.pixels)
+        return Found(_rays(lens_of_brown(*found, given.size), given.pixels))
 
     return method
 
@@ -109,11 +132,9 @@ def brown(
     corners: np.ndarray, board: np.ndarray, size: tuple[int, int], flags: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The camera matrix and the coefficients of `cv2.calibrateCamera`."""
-    points = [board.astype(np.float32)] * len(corners)
+    points, places = _seen(corners.astype(np.float32), board.astype(np.float32))
     try:
-        _, matrix, d, *_ = cv2.calibrateCamera(
-            points, [*corners.astype(np.float32)[:, :, None]], size[::-1], None, None, flags=flags
-        )
+        _, matrix, d, *_ = cv2.calibrateCamera(points, places, size[::-1], None, None, flags=flags)
     except cv2.error as error:
         raise FailedError(str(error).strip().splitlines()[-1]) from None
     if not (np.isfinite(matrix).all() and np.isfinite(d).all()):
@@ -121,11 +142,11 @@ def brown(
     return matrix, d.ravel()
 
 
-def fisheye(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
+def fisheye(flags: int, limit: float) -> Method:
     """`cv2.fisheye.calibrate`. As its users do, a picture that it calls ill-conditioned is left
     out, and it is tried again."""
 
-    def method(given: Given) -> np.ndarray:
+    def method(given: Given) -> Found:
         left = [*given.within(limit)]
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-8)
         height, width = given.size
@@ -134,10 +155,12 @@ def fisheye(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
                 [[given.focal, 0, (width - 1) / 2], [0, given.focal, (height - 1) / 2], [0, 0, 1]]
             )
             try:
+                points, places = (
+                    [x[None] for x in each] for each in _seen(np.array(left), given.board)
+                )
                 _, matrix, d, *_ = cv2.fisheye.calibrate(
-                    [given.board[None]] * len(left), [picture[None] for picture in left],
-                    (width, height), guess, np.zeros(4), flags=flags, criteria=stop,
-                )  # fmt: skip
+                    points, places, (width, height), guess, np.zeros(4), flags=flags, criteria=stop
+                )
                 break
             except cv2.error as error:
                 ill = re.search(r"input array (\d+)", str(error))
@@ -147,7 +170,7 @@ def fisheye(flags: int, limit: float) -> Callable[[Given], np.ndarray]:
         if not (np.isfinite(matrix).all() and np.isfinite(d).all()):
             raise FailedError("the numbers are not finite")
         lens = _of_opencv(KannalaBrandt, matrix, given.size, radial=_row(*d.ravel()))
-        return _rays(lens, given.pixels)
+        return Found(_rays(lens, given.pixels))
 
     return method
 
@@ -159,6 +182,7 @@ def _program(command: list[str], given: Given, corners: np.ndarray) -> dict[str,
             there, corners=corners, points=given.board, columns=given.columns,
             rows=len(given.board) // given.columns, size=given.size, focal=given.focal,
             square=np.linalg.norm(given.board[1] - given.board[0]), pixels=given.pixels,
+            flat=given.flat,
         )  # fmt: skip
         # Its packages are its own.
         env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
@@ -170,20 +194,21 @@ def _program(command: list[str], given: Given, corners: np.ndarray) -> dict[str,
         return dict(np.load(back))
 
 
-def omnidir(given: Given) -> np.ndarray:
+def omnidir(given: Given) -> Found:
     found = _program([OMNIDIR, str(FOLDER / "calibrate_omnidir.py")], given, given.corners)
     matrix, xi, d = found["matrix"], float(found["xi"].squeeze()), found["distortion"].ravel()
     terms = dict(xi=_row(xi)[0], radial=_row(d[0], d[1]), tangential=_row(d[2], d[3]))
-    return _rays(_of_opencv(Mei, matrix, given.size, **terms), given.pixels)
+    return Found(_rays(_of_opencv(Mei, matrix, given.size, **terms), given.pixels))
 
 
-def mrcal(model: str, limit: float) -> Callable[[Given], np.ndarray]:
-    def method(given: Given) -> np.ndarray:
+def mrcal(model: str, limit: float) -> Method:
+    def method(given: Given) -> Found:
         name = "LENSMODEL_" + model.format(fov=round(1.05 * given.fov))
         command = [MRCAL, str(FOLDER / "calibrate_mrcal.py"), name]
-        rays = _program(command, given, given.within(limit))["rays"]
+        found = _program(command, given, given.within(limit))
         with np.errstate(invalid="ignore"):
-            return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+            rays = found["rays"] / np.linalg.norm(found["rays"], axis=1, keepdims=True)
+        return Found(rays, None if given.flat else found["board"])
 
     return method
 
@@ -209,6 +234,8 @@ PEERS = {
     "mrcal, splined": mrcal(SPLINED, 180),
 }
 METHODS = OURS | PEERS
+# The tools that do not come with OpenCV.
+NEEDS = {"cv2.omnidir": "opencv-contrib", "mrcal, OPENCV8": "mrcal", "mrcal, splined": "mrcal"}
 
 
 def versions() -> dict[str, str]:

@@ -1,130 +1,133 @@
-"""Real chessboards: those of OpenCV's documentation, with the calibrations that it ships.
+"""Real boards: each method is judged by the corners in pictures that it did not get.
 
-Debian's package `opencv-doc` has 13 pictures of a left and of a right camera. A method is judged by
-its leave-one-out error: fit on the other pictures, find the pose of the one left out, and measure
-the distances of its corners.
+Five fits leave out a fifth of the pictures each. Then only the poses of the boards in the pictures
+that were left out are fitted, and the distances of their corners are measured. The pictures are
+those of Debian's package `opencv-doc`, and of public repositories that are cloned into a folder.
 """
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from calibrate_peers import FailedError, brown, lens_of_brown
-from calibrate_rays import grid, ray_errors
+from calibrate_peers import METHODS, NEEDS, FailedError, Given, Method
+from calibrate_tables import REAL
 from torch import Tensor
 
-from darswin.calibrate import Board, CalibrationError, calibrate, find_corners
-from darswin.lens import Lens, load
+from darswin.calibrate import Board, CalibratedLens, calibrate, find_corners, radial
+from darswin.lens import Lens
 
-DATA = Path("/usr/share/doc/opencv-doc/examples/data")
-BOARD = Board.chessboard(9, 6, 0.025)
-AUTO = "ours, auto"
-Method = Callable[[np.ndarray, tuple[int, int]], Lens]
-
-
-def by_ours(model: str) -> Method:
-    def method(corners: np.ndarray, size: tuple[int, int]) -> Lens:
-        try:
-            return calibrate(corners, BOARD, size, model).lens
-        except CalibrationError as error:
-            raise FailedError(str(error)) from None
-
-    return method
+OPENCV = "/usr/share/doc/opencv-doc/examples/data"
+FOLDS, OFF = 5, 6.0  # standard deviations: a corner that is farther off counts for no method
+SQUARE = 0.03  # the unit does not matter
 
 
-def by_opencv(flags: int) -> Method:
-    def method(corners: np.ndarray, size: tuple[int, int]) -> Lens:
-        return lens_of_brown(*brown(corners, _flat(), size, flags), size)
+class Boards(NamedTuple):
+    """Pictures of a chessboard with columns × rows inner corners; the pattern of their names."""
 
-    return method
+    pictures: str
+    columns: int
+    rows: int
 
 
-METHODS = {
-    "ours, BrownConrady": by_ours("BrownConrady"),
-    "ours, KannalaBrandt": by_ours("KannalaBrandt"),
-    AUTO: by_ours("auto"),
-    "cv2.calibrateCamera": by_opencv(0),
-    "cv2.calibrateCamera, rational": by_opencv(cv2.CALIB_RATIONAL_MODEL),
+SETS = {
+    "OpenCV, left": Boards(f"{OPENCV}/left[0-9][0-9].jpg", 9, 6),
+    "OpenCV, right": Boards(f"{OPENCV}/right[0-9][0-9].jpg", 9, 6),
+    "OCamCalib, fish_1": Boards("py-OCamCalib/test_images/fish_1/*.jpg", 8, 6),
+    "OCamCalib, fish_2": Boards("py-OCamCalib/test_images/fish_2/*.jpg", 8, 6),
+    "stereo, left": Boards("fisheye-stereo-calibration/imgs/left*.jpg", 9, 6),
+    "stereo, right": Boards("fisheye-stereo-calibration/imgs/right*.jpg", 9, 6),
+    "camodocal, front": Boards("camodocal/data/images/*.bmp", 9, 6),
 }
 
 
-def _flat() -> np.ndarray:
-    points = np.asarray(BOARD.points, dtype=float)
-    return np.concatenate((points, np.zeros((len(points), 1))), 1)
+def files_of(boards: Boards, folder: Path) -> list[Path]:
+    """The pictures that are there; each pattern is of names below a folder, or of whole names."""
+    whole = folder / boards.pictures
+    return sorted(whole.parent.glob(whole.name))
 
 
-def miss(lens: Lens, corners: np.ndarray) -> np.ndarray:
-    """(K, 2) px: by how much a lens misses the corners of one picture, in the pose that makes the
-    squares smallest."""
-    lens = lens.with_theta_max(None)
-    board, pixels = torch.from_numpy(_flat()), torch.from_numpy(corners)
-    rays = lens.unproject_points(pixels).numpy()
-    _, turn, shift = cv2.solvePnP(board.numpy(), rays[:, :2] / rays[:, 2:], np.eye(3), None)
-    start = torch.from_numpy(cv2.Rodrigues(turn)[0])
+def real_set(name: str, files: list[Path], tools: dict[str, str]) -> dict:
+    """The errors of the methods whose tools are there, on pictures that were left out."""
+    _, columns, rows = SETS[name]
+    board = Board.chessboard(columns, rows, SQUARE)
+    # Some sets have a picture twice.
+    read = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
+    pictures = [*{picture.tobytes(): picture for picture in read if picture is not None}.values()]
+    (size,) = {picture.shape for picture in pictures}
+    corners = np.stack([find_corners(picture, board) for picture in pictures])
+    corners = corners[np.isfinite(corners).all((1, 2))]
+    whole = calibrate(corners, board, size, "KannalaBrandt")
+    distance = whole.residuals.norm(dim=-1).numpy()
+    wrong = distance > OFF * whole.sigma
+    corners[wrong] = np.nan
+    results = {
+        method: left_out(METHODS[method], corners, board, size, whole)
+        for method in REAL
+        if NEEDS.get(method, "opencv") in tools
+    }
+    return dict(
+        set=name, of=len(pictures), pictures=len(corners), corners=corners[..., 0].size,
+        wrong=int(wrong.sum()), results=results,
+    )  # fmt: skip
+
+
+def left_out(
+    method: Method, corners: np.ndarray, board: Board, size: tuple[int, int], whole: CalibratedLens
+) -> dict:
+    """The root mean square and the median distance, px, over all pictures, each left out once; how
+    many of them no lens was found for, or one that does not see them; and the models chosen."""
+    flat = np.pad(board.points, ((0, 0), (0, 1)))
+    measure = whole.lens.with_theta_max(None)
+    near = torch.full((1, 1), 0.02, dtype=torch.float64)
+    angles = np.degrees(whole.theta.numpy())
+    distances, failed, models = [], 0, []
+    for k in range(FOLDS):
+        out = np.arange(len(corners)) % FOLDS == k
+        given = Given(
+            corners[~out], flat, board.columns, size, angles[~out],
+            2 * float(np.nanmax(angles)), measure.project(near).item() / 0.02,
+            "KannalaBrandt", corners[out].reshape(-1, 2), flat=False,
+        )  # fmt: skip
+        try:
+            found = method(given)
+        except FailedError:
+            failed += int(out.sum())
+            continue
+        models += [found.model] * (found.model != "")
+        rays = found.rays.reshape(*corners[out].shape[:2], 3)
+        solid = flat if found.board is None else found.board
+        for picture, seen in zip(rays, ~np.isnan(corners[out]).any(2), strict=True):
+            off = miss(measure, solid, picture, seen)
+            failed += off is None
+            distances += [] if off is None else [off]
+    result = dict(failed=failed, models=[*dict.fromkeys(models)])
+    if distances:
+        off = np.concatenate(distances)
+        result |= dict(error=float(np.sqrt(np.square(off).mean())), median=float(np.median(off)))
+    return result
+
+
+def miss(measure: Lens, board: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
+    """(K',) px: the distances of the rays (K, 3) of the seen corners from a board (K, 3), in the
+    pose that makes their squares smallest. One lens measures the angles of all methods in pixels,
+    so a method needs no projection. None if a seen corner has no ray."""
+    if not np.isfinite(rays[seen]).all():
+        return None
+    solid = torch.from_numpy(board[seen] - board[seen].mean(0))
+    to = torch.nn.functional.normalize(torch.from_numpy(rays[seen]), dim=-1)
+    goal = measure.project_points(to)
+    turns, shifts = radial.poses(to[None], torch.ones(1, len(to)).to(to), solid[:, :2])
 
     def off(pose: Tensor) -> Tensor:
         axes = torch.linalg.cross(pose[:3].expand(3, 3), torch.eye(3).to(pose)).T
-        return lens.project_points(board @ (torch.matrix_exp(axes) @ start).T + pose[3:]) - pixels
+        turned = solid @ (torch.matrix_exp(axes) @ turns[0]).T
+        return measure.project_points(turned + shifts[0] + pose[3:]) - goal
 
-    pose = torch.from_numpy(np.concatenate((np.zeros(3), shift[:, 0])))
-    for _ in range(10):
+    pose = solid.new_zeros(6)
+    for _ in range(15):
         slopes = torch.func.jacfwd(off)(pose).reshape(-1, 6)
         pose = pose - torch.linalg.lstsq(slopes, off(pose).reshape(-1, 1)).solution[:, 0]
-    return off(pose).numpy()
-
-
-def left_out(method: Method, corners: np.ndarray, size: tuple[int, int]) -> list[float | None]:
-    """px: the root mean square distance of the corners of each picture from a fit on the others;
-    None where that fit does not see all corners."""
-    return [_error(method(np.delete(corners, k, 0), size), one) for k, one in enumerate(corners)]
-
-
-def _error(lens: Lens, corners: np.ndarray) -> float | None:
-    error = float(np.sqrt(np.square(miss(lens, corners)).sum(1).mean()))
-    return error if np.isfinite(error) else None
-
-
-def published(data: Path, camera: str) -> Lens:
-    """The calibration that OpenCV ships."""
-    if camera == "left":
-        lens = load(data / "left_intrinsics.yml")
-    else:
-        file = cv2.FileStorage(str(data / "intrinsics.yml"), cv2.FILE_STORAGE_READ)
-        lens = lens_of_brown(file.getNode("M2").mat(), file.getNode("D2").mat().ravel(), (480, 640))
-    return lens.to(torch.float64)
-
-
-def real_cameras(data: Path, auto: bool = True) -> list[dict]:
-    """Of each camera: the errors of all methods, and how far their rays are from the published."""
-    cameras = []
-    for camera in ("left", "right"):
-        files = sorted(data.glob(f"{camera}[0-9][0-9].jpg"))
-        pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
-        size = pictures[0].shape
-        corners = np.stack([find_corners(picture, BOARD) for picture in pictures])
-        seen = np.isfinite(corners).all((1, 2))
-        corners, pixels = corners[seen], grid(size)
-        known = published(data, camera).with_theta_max(None)
-        rays = known.unproject_points(torch.from_numpy(pixels)).numpy()
-        there = np.isfinite(rays).all(1)
-        results = {}
-        for name, method in METHODS.items():
-            if name == AUTO and not auto:
-                continue
-            lens = method(corners, size)
-            # The model that is best for all pictures is also that of the fits without one.
-            again = by_ours(type(lens).__name__) if name == AUTO else method
-            found = lens.with_theta_max(None).unproject_points(torch.from_numpy(pixels[there]))
-            off = ray_errors(found.numpy(), rays[there])
-            results[name] = dict(
-                model=type(lens).__name__, left_out=left_out(again, corners, size),
-                median=float(np.median(off)), most=float(np.quantile(off, 0.95)),
-            )  # fmt: skip
-        stored = [_error(known, one) for one in corners]
-        names = [file.name for file, whole in zip(files, seen, strict=True) if whole]
-        cameras.append(
-            dict(camera=camera, pictures=names, of=len(files), published=stored, results=results)
-        )
-    return cameras
+    found = off(pose).norm(dim=1).numpy()
+    return found if np.isfinite(found).all() else None

@@ -15,7 +15,10 @@ SUCCESS = 0.5  # degrees: a success has a smaller median error
 NOISE = 0.2  # px
 MOST_PICTURES = 20  # of the tables by field of view and by model
 AUTO, ONE, TOLD = OURS = "ours, auto", "ours, KannalaBrandt", "ours, true model"
-OPENCV = "cv2.calibrateCamera"
+REAL = (  # the methods of real boards
+    AUTO, ONE, "cv2.calibrateCamera", "cv2.calibrateCamera, rational",
+    "cv2.fisheye, flags and guess", "cv2.omnidir", "mrcal, splined",
+)  # fmt: skip
 SHOWN = (
     AUTO, ONE, "cv2.calibrateCamera, rational", "cv2.fisheye, flags",
     "cv2.fisheye, flags and guess", "cv2.omnidir", "mrcal, splined",
@@ -190,34 +193,29 @@ def by_model(record: dict) -> str:
     return markdown(["true lens", "fields of view", *OURS, "best of the others"], rows)
 
 
-def _left_out(result: dict) -> float | None:
-    """px: over all pictures; None if some left-out picture is not seen."""
-    if None in result["left_out"]:
-        return None
-    return math.sqrt(statistics.mean(value**2 for value in result["left_out"]))
-
-
 def real(record: dict) -> str:
-    cameras = record["real"]
-    if not cameras:
+    """Real boards: the errors of pictures that were left out, px."""
+    if not record["real"]:
         return "The pictures were not there."
     rows = []
-    for name in cameras[0]["results"]:
+    for of in record["real"]:
         cells = []
-        for camera in cameras:
-            result = camera["results"][name]
-            error = _left_out(result)
-            missing = result["left_out"].count(None)
-            cells.append(f"fails for {missing}" if error is None else f"{error:.4f}")
-            cells.append(f"{result['median']:.2f}° ({result['most']:.2f}°)")
-        model = " / ".join(dict.fromkeys(c["results"][name]["model"] for c in cameras))
-        rows.append([name + (f": {model}" if name == AUTO else ""), *cells])
-    heads = [
-        head
-        for camera in cameras
-        for head in (f"{camera['camera']}: left out (px)", "from the published")
-    ]
-    return markdown(["", *heads], rows)
+        for name in REAL:
+            if (result := of["results"].get(name)) is None:
+                cells.append("–")
+            elif result["failed"]:
+                cells.append(f"fails for {result['failed']}")
+            else:
+                cells.append(f"{result['error']:.3f} ({result['median']:.3f})")
+        models = " / ".join(of["results"][AUTO]["models"])
+        rows.append([of["set"], f"{of['pictures']} of {of['of']}", *cells, models])
+    return markdown(["px", "pictures", *REAL, "auto's models"], rows)
+
+
+def _best_real(of: dict) -> float:
+    """The smallest error of the other methods that fail for no picture of a real set."""
+    others = (of["results"][name] for name in REAL if name not in OURS and name in of["results"])
+    return min(result["error"] for result in others if not result["failed"])
 
 
 def targets(record: dict) -> str:
@@ -231,12 +229,10 @@ def targets(record: dict) -> str:
         "error, to the best of the others in each set": "at most 1.1 times",
     }
     rows = [[*aim, *cells] for aim, *cells in zip(aims.items(), *found, strict=True)]
-    for camera in record["real"]:
-        other = _left_out(camera["results"][OPENCV])
-        errors = [_left_out(camera["results"][n]) for n in (AUTO, ONE)]
-        cells = [f"{error:.4f}" for error in errors]
-        aim = f"OpenCV's {other:.4f}"
-        rows.append([f"leave-one-out error (px), {camera['camera']} camera", aim, *cells, ""])
+    for of in record["real"]:
+        cells = [f"{of['results'][name]['error']:.4f}" for name in (AUTO, ONE)]
+        aim = f"the best other's {_best_real(of):.4f}"
+        rows.append([f"left out (px), {of['set']}", aim, *cells, ""])
     return markdown(["", "target", *OURS], rows)
 
 
