@@ -359,11 +359,22 @@ def test_the_best_model_that_is_accepted_is_taken(usual):
     assert type(of(usual, "auto", accept=lambda lens: False).lens).__name__ == table[0]
 
 
-def test_left_out_pictures_that_are_missed_are_doubted(usual):
+def left_out_doubts(found, seen):
+    said = doubts(found, ~seen.corners.isnan().any(-1), seen.board.new_zeros(3))
+    return [text for text in said if "that were left out are missed" in text]
+
+
+@pytest.mark.parametrize("times", [1.5, 5.0])
+def test_left_out_pictures_that_are_missed_are_doubted(usual, times):
     found = of(usual)
-    for times in (1.5, 5.0):
-        found = dataclasses.replace(found, left_out=times * found.sigma)
-        said = doubts(found, ~usual.corners.isnan().any(-1), torch.zeros(3, dtype=f64))
-        assert len([text for text in said if "that were left out are missed" in text]) == (
-            times > 4
-        )
+    found = dataclasses.replace(found, left_out=times * found.sigma)
+    assert len(left_out_doubts(found, usual)) == (times > 4)
+
+
+@pytest.mark.parametrize(("model", "noise"), [("KannalaBrandt", 0.2), ("Fisheye624", 2.0)])
+def test_too_many_numbers_for_few_pictures_miss_those_left_out(model, noise):
+    lens = true_lens("KannalaBrandt", 190).with_theta_max(0.8)
+    seen = rig(lens, 4, noise=noise, least=10)
+    found = of(seen, model)
+    assert (found.left_out > 2.5 * found.sigma) == (model == "Fisheye624")
+    assert bool(left_out_doubts(found, seen)) == (found.left_out > 4 * found.sigma)
