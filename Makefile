@@ -170,7 +170,7 @@ $(CONTRIB)/installed:
 	$(CONTRIB)/bin/pip install -q opencv-contrib-python-headless==$$(sed -n "s/^opencv-python-headless==//p" requirements.txt)
 	@touch $@
 
-study-calibrate: build $(CONTRIB)/installed  ## study calibrations from corners of boards (15 minutes; needs `apt-get install mrcal opencv-doc`)
+study-calibrate: build $(CONTRIB)/installed  ## study calibrations from corners of boards (half an hour; needs `apt-get install mrcal opencv-doc`)
 	$(BIN)/python studies/calibrate.py
 
 study-estimate: build  ## study lenses estimated from lines (6 minutes; needs `apt-get install freedoom opencv-doc`)
