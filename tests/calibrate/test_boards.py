@@ -10,7 +10,8 @@ from calibrate_boards import Pose, Renderer
 from helpers import refused
 
 from darswin.calibrate import Board, find_corners
-from darswin.calibrate.boards import edge_width, image_circle, pixels_per_unit, shown_instead, wrong
+from darswin.calibrate.boards import edge_width, pixels_per_unit, shown_instead, wrong
+from darswin.calibrate.circle import image_circle
 from darswin.lens import Equidistant, Lens, Perspective
 
 CHESSBOARD = Board.chessboard(9, 6, 0.025)
@@ -63,8 +64,8 @@ def test_a_board_seen_in_part_keeps_its_numbers(kind):
     for pose in view.poses(board, 3, rng):
         picture = view.picture(board, pose, rng)
         true = view.corners(board, pose)
-        # A hand lies on a half of the board.
-        middle = np.nanmedian(true[:, 0])
+        # A hand lies on a part of the board.
+        middle = np.nanquantile(true[:, 0], 0.6)
         picture[:, int(middle) :] = 90
         found = find_corners(picture, board)
         assert np.isnan(found[true[:, 0] > middle + 3]).all()

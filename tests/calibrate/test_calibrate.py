@@ -15,6 +15,7 @@ from torch.testing import assert_close
 from darswin.calibrate import CalibrationError, calibrate
 from darswin.calibrate.doubts import doubts
 from darswin.calibrate.refine import Free, State, Views, refine
+from darswin.calibrate.steady import Steadiness
 from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
 from darswin.lens.solve import direction_of, vector_of
 
@@ -280,7 +281,7 @@ def test_left_out_is_the_error_of_pictures_that_were_left_out():
         flat = (true.board - true.board.mean(0)) / unit
         seen = ~true.corners[k : k + 1].isnan().any(-1)
         solid, middle = (torch.nn.functional.pad(p, (0, 1)) for p in (flat, true.board.mean(0)))
-        views = Views(true.corners[k : k + 1].nan_to_num(), seen, solid)
+        views = Views(true.corners[k : k + 1].nan_to_num(), seen, solid, torch.zeros(1).long())
         shift = (found.translations[k : k + 1] + found.rotations[k : k + 1] @ middle) / unit
         lens = rest.lens.with_theta_max(None)
         state = State(rest._vector, lens, found.rotations[k : k + 1], shift)
@@ -363,7 +364,8 @@ def test_left_out_pictures_that_are_missed_are_doubted(usual):
     found = of(usual)
     for times in (1.5, 5.0):
         found = dataclasses.replace(found, left_out=times * found.sigma)
-        said = doubts(found, ~usual.corners.isnan().any(-1), torch.zeros(3, dtype=f64))
+        steady = Steadiness(12, 0.0, 0.0, 0.0, 0.0)
+        said = doubts(found, ~usual.corners.isnan().any(-1), torch.zeros(3, dtype=f64), steady)
         assert len([text for text in said if "that were left out are missed" in text]) == (
             times > 4
         )
