@@ -15,7 +15,7 @@ from torch.testing import assert_close
 from darswin.calibrate import CalibrationError, calibrate
 from darswin.calibrate.doubts import doubts
 from darswin.calibrate.refine import Free, State, Views, refine
-from darswin.calibrate.steady import Steadiness
+from darswin.calibrate.steady import Steadiness, places
 from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
 from darswin.lens.solve import direction_of, vector_of
 
@@ -369,3 +369,18 @@ def test_left_out_pictures_that_are_missed_are_doubted(usual):
         assert len([text for text in said if "that were left out are missed" in text]) == (
             times > 4
         )
+
+
+def test_bursts_show_the_board_at_one_place(usual):
+    lens = rig(true_lens("KannalaBrandt", 190), 9)
+    g = torch.Generator().manual_seed(0)
+    burst = lens.corners[4:5] + 0.2 * torch.randn(10, 54, 2, generator=g, dtype=f64)
+    corners = torch.cat((lens.corners[:4], burst, lens.corners[5:]))
+    seen = ~corners.isnan().any(-1)
+    assert places(corners.nan_to_num(), seen).tolist() == [0, 1, 2, 3, *[4] * 10, 14, 15, 16, 17]
+    few = of(lens._replace(corners=corners[2:14]))
+    assert [t for t in few.doubts if t.startswith("12 pictures show the board at 3 places")]
+    many = of(lens._replace(corners=corners))
+    assert not [t for t in many.doubts if "places" in t]
+    # Leaving out a part of a burst says nothing: it is left out whole.
+    assert math.isnan(few.left_out) and many.left_out > many.error
