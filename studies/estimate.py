@@ -29,7 +29,7 @@ from worlds.wad import load_map, map_names
 from darswin import lens as kinds
 from darswin import load_model
 from darswin.calibrate import CalibrationError, lines
-from darswin.calibrate.boards import image_circle
+from darswin.calibrate.circle import image_circle
 from darswin.calibrate.edges import curves
 from darswin.lens import Lens, Perspective
 from darswin.views import CameraView

@@ -1,7 +1,7 @@
 """Calibration boards, and their corners in pictures."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -15,8 +15,9 @@ from darswin.utils.parameters import check
 Kind = Literal["chessboard", "charuco", "april"]
 
 LEAST_SIDE = 16  # px: smaller pictures show nothing
-TRIPLES = 2000  # of points of the rim
 SIDE = 1200  # px, to which larger pictures are reduced at first
+RING = 1.5  # px: smaller ones around a corner show nothing
+UNLIKE = 0.3  # of the range of light; right corners have 0.15 at most
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
@@ -27,7 +28,8 @@ class Board:
     Attributes:
         columns, rows: of the grid of corners. square: the side of a square or a tag, in metres or
             any unit of length. other: the side of a marker in a ChArUco board's squares, or the gap
-            between tags. dictionary: OpenCV's name of the markers, such as "4X4_50".
+            between tags. dictionary: OpenCV's name of the markers, such as "4X4_50". first_tag:
+            the number with which AprilTags begin.
     """
 
     kind: Kind
@@ -36,6 +38,7 @@ class Board:
     square: float
     other: float = 0.0
     dictionary: str = ""
+    first_tag: int = 0
 
     @classmethod
     def chessboard(cls, columns: int, rows: int, square: float) -> Self:
@@ -56,13 +59,15 @@ class Board:
 
     @classmethod
     def april_grid(
-        cls, columns: int, rows: int, tag: float, gap: float, dictionary: str = "APRILTAG_36h11"
-    ) -> Self:
+        cls, columns: int, rows: int, tag: float, gap: float, dictionary: str = "APRILTAG_36h11",
+        first_tag: int = 0,
+    ) -> Self:  # fmt: skip
         """A grid of `columns` × `rows` AprilTags with the side `tag` and a `gap` between them. They
-        count from the upper left, or from the lower left as Kalibr draws them."""
+        count up from `first_tag` at the upper left, or the lower left as Kalibr draws them."""
         _check(columns, rows, 1, square=tag, gap=gap)
-        _dictionary(dictionary, columns * rows)
-        return cls("april", 2 * columns, 2 * rows, tag, gap, dictionary)
+        check("first_tag", first_tag, type(first_tag) is int and first_tag >= 0, "0 or more")
+        _dictionary(dictionary, first_tag + columns * rows)
+        return cls("april", 2 * columns, 2 * rows, tag, gap, dictionary, first_tag)
 
     @property
     def points(self) -> np.ndarray:
@@ -72,6 +77,13 @@ class Board:
         april = pair * (self.square + self.other) + second * self.square
         place = april if self.kind == "april" else place * self.square
         return np.stack(np.meshgrid(place[: self.columns], place[: self.rows]), -1).reshape(-1, 2)
+
+    @property
+    def markers(self) -> range:
+        """The numbers of the markers."""
+        cells = (self.columns + 1) * (self.rows + 1) // 2
+        count = self.columns * self.rows // 4 if self.kind == "april" else cells
+        return range(self.first_tag, self.first_tag + count)
 
     @property
     def reach(self) -> float:
@@ -97,7 +109,7 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
         raise TypeError("a picture must be an array of uint8")
     if picture.ndim not in (2, 3) or np.atleast_3d(picture).shape[2] not in (1, 3):
         raise ValueError(f"a picture must be (H, W), (H, W, 1) or (H, W, 3), got {picture.shape}")
-    grey = _grey(picture)
+    grey = grey_of(picture)
     find = {"chessboard": _chessboards, "charuco": _charuco, "april": _tags}[board.kind]
     for grid in find(grey, board) if min(grey.shape) >= LEAST_SIDE else ():
         grid = _refined(grey, grid, board)
@@ -112,7 +124,7 @@ def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:
 
 def shown_instead(picture: np.ndarray, board: Board) -> str:
     """What a picture without the board shows in its place, in words; "" if nothing is known."""
-    grey, _ = next(_scales(_grey(picture)))
+    grey, _ = next(_scales(grey_of(picture)))
     if board.kind == "chessboard":
         flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         there, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
@@ -121,26 +133,23 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
         return "" if known else f"{columns}x{rows} inner corners"
     if np.isfinite(find_corners(grey[:, ::-1], board)).any():
         return "it mirrored, flip them first"
-    parameters = cv2.aruco.DetectorParameters()
-    found: dict[str, list[int]] = {}
-    for name in (name for name in _names() if "H" not in name):  # 36H11 is another name of 36h11
-        # Kalibr draws the tags of its only set with a border of two bits.
-        for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
-            detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
-            numbers = detect(grey)[1]
-            seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
-            found[name] = max(found.get(name, []), seen, key=len)
-    most = max(map(len, found.values()))
-    if most < 4:
-        return ""
-    # The larger sets of a kind contain the smaller ones, and find more that is no marker.
-    near = [name for name, seen in found.items() if len(seen) > 0.75 * most]
-    name = min(near, key=lambda n: (n != board.dictionary, len(_dictionary(n).bytesList)))
-    seen, said = sorted(found[name]), f"markers {min(found[name])} to {max(found[name])} of {name}"
-    cells = (board.columns + 1) * (board.rows + 1) // 2
-    count = board.columns * board.rows // 4 if board.kind == "april" else cells
-    if name != board.dictionary or seen[len(seen) // 2] >= count:
+    name, seen = board.dictionary, _numbers(grey, board.dictionary)
+    if sum(number in board.markers for number in seen) < max(4, 0.75 * len(seen)):
+        # 36H11 is another name of 36h11.
+        found = {name: _numbers(grey, name) for name in _names() if "H" not in name}
+        most = max(map(len, found.values()))
+        if most < 4:
+            return ""
+        # The larger sets of a kind contain the smaller ones, and find more that is no marker.
+        near = [name for name, of in found.items() if len(of) > 0.75 * most]
+        name = min(near, key=lambda n: (n != board.dictionary, len(_dictionary(n).bytesList)))
+        seen = found[name]
+    said = f"markers {seen[0]} to {seen[-1]} of {name}"
+    if name != board.dictionary:
         return said
+    if seen[len(seen) // 2] not in board.markers:
+        begins = board.kind == "april" and seen[-1] - seen[0] < len(board.markers)
+        return said + f", but the first tag of the board is {board.first_tag}" * begins
     why = "the markers are too small or cut off, or columns and rows are swapped"
     if board.kind == "april":
         why = "columns and rows are swapped, or the gap is a ratio in place of a length"
@@ -174,7 +183,7 @@ def pixels_per_unit(grid: np.ndarray, board: Board) -> np.ndarray:
 def edge_width(picture: np.ndarray, corners: np.ndarray, board: Board) -> float:
     """px, of the edges at the corners of a board: 2 where they are sharp, and 2.5 σ where they are
     blurred by a Gaussian."""
-    grey = _grey(picture).astype(np.float64)
+    grey = grey_of(picture).astype(np.float64)
     reach = pixels_per_unit(_shaped(corners, board), board).ravel() * board.reach
     widths = []
     for (x, y), half in zip(corners, np.clip(reach, 2, 15), strict=True):
@@ -183,53 +192,6 @@ def edge_width(picture: np.ndarray, corners: np.ndarray, board: Board) -> float:
             patch = grey[rows, columns]
             widths.append(np.ptp(patch) / max(np.hypot(*np.gradient(patch)).max(), 1e-9))
     return float(np.median(widths))
-
-
-def image_circle(pictures: Iterable[np.ndarray]) -> tuple[float, float, float] | None:
-    """The middle (x, y) and the radius, px, of the circle that a fisheye fills on its sensor.
-
-    None if there is none: the pictures have bright corners, or their bright part is not round.
-    """
-    brightest = np.maximum.reduce([_grey(picture) for picture in pictures])
-    height, width = brightest.shape
-    if min(height, width) < LEAST_SIDE:
-        return None
-    light = cv2.GaussianBlur(brightest, (0, 0), 1.0)
-    part = max(2, min(height, width) // 40)
-    ends = slice(part), slice(-part, None)
-    dark = max(np.median(light[rows, columns]) for rows in ends for columns in ends)
-    middle = np.median(light[height // 4 : -height // 4, width // 4 : -width // 4])
-    there = (light > dark + max(4.0, 0.15 * (middle - dark))).astype(np.uint8)
-    outlines, _ = cv2.findContours(there, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if dark > 0.25 * middle or not outlines:
-        return None
-    rim = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64)
-    rim = rim[((rim > 1) & (rim < (width - 2, height - 2))).all(1)]
-    # Circles through three points of the rim. Many more must be near the right one. Dents, such as
-    # dark boards make, are inside of it, and nothing is outside.
-    rows, squares = np.column_stack((2 * rim, np.ones(len(rim)))), np.square(rim).sum(1)
-    chosen = np.random.default_rng(0).integers(len(rim) or 1, size=(TRIPLES, 3))[
-        : TRIPLES * len(rim)
-    ]
-    chosen = chosen[np.abs(np.linalg.det(rows[chosen])) > 1e-3 * width**2]
-    most, near = 0, np.zeros(len(rim), bool)
-    for a, b, c in np.linalg.solve(rows[chosen], squares[chosen][..., None])[..., 0]:
-        radius = math.sqrt(c + a * a + b * b)
-        off, step = np.hypot(*(rim - (a, b)).T) - radius, max(2.0, 0.015 * radius)
-        count = (np.abs(off) < step).sum() - 2 * (off > step).sum()
-        if count > most and radius < max(height, width):
-            most, near = count, np.abs(off) < step
-    if near.sum() < 16:
-        return None
-    a, b, c = np.linalg.lstsq(rows[near], squares[near], rcond=None)[0].tolist()
-    radius = math.sqrt(c + a * a + b * b)
-    # Of the circle that the picture shows, a large part must be there.
-    turn = np.arange(360)
-    x, y = a + radius * np.cos(np.radians(turn)), b + radius * np.sin(np.radians(turn))
-    shown = (x > 1) & (x < width - 2) & (y > 1) & (y < height - 2)
-    found = np.degrees(np.arctan2(rim[near, 1] - b, rim[near, 0] - a)) % 360
-    there = np.isin(turn, found.astype(int)) & shown
-    return (a, b, radius) if there.sum() >= max(90, 0.7 * shown.sum()) else None
 
 
 def _scales(grey: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
@@ -278,7 +240,7 @@ def _charuco(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     for white_first in (False, True):
         drawn.setLegacyPattern(white_first)
         detect = cv2.aruco.CharucoDetector(drawn).detectBoard
-        yield _shaped(_collected(grey, detect, len(board.points), 1), board)
+        yield _shaped(_collected(grey, detect, range(len(board.points)), 1), board)
 
 
 def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
@@ -288,7 +250,7 @@ def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
     parameters, found = cv2.aruco.DetectorParameters(), []
     for parameters.markerBorderBits in (1, 2):
         detector = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), parameters)
-        found.append(_collected(grey, detector.detectMarkers, rows * columns, 4))
+        found.append(_collected(grey, detector.detectMarkers, board.markers, 4))
     tags = max(found, key=lambda corners: np.isfinite(corners).sum())
     for turn in range(4):
         # A tag's corners run clockwise: upper left, upper right, lower right, lower left.
@@ -297,35 +259,77 @@ def _tags(grey: np.ndarray, board: Board) -> Iterator[np.ndarray]:
             yield _shaped(way.swapaxes(1, 2), board)
 
 
-def _collected(grey: np.ndarray, detect: Callable[..., tuple], count: int, each: int) -> np.ndarray:
-    """(count, each, 2) px: what a detector of markers finds at all scales, else NaN."""
-    found = np.full((count, each, 2), np.nan)
+def _collected(
+    grey: np.ndarray, detect: Callable[..., tuple], which: range, each: int
+) -> np.ndarray:
+    """(count, each, 2) px: what a detector finds of some markers at all scales, else NaN."""
+    found = np.full((len(which), each, 2), np.nan)
     for tried, scale in _scales(grey):
         corners, numbers, *_ = detect(tried)
         seen = () if numbers is None else zip(numbers.ravel(), corners, strict=True)
         for number, corner in seen:
-            if number < count and np.isnan(found[number]).any():
-                found[number] = (corner.reshape(each, 2) + 0.5) / scale - 0.5
+            if number in which and np.isnan(found[number - which[0]]).any():
+                found[number - which[0]] = (corner.reshape(each, 2) + 0.5) / scale - 0.5
         if not np.isnan(found).any():
             break
     return found
 
 
+def _numbers(grey: np.ndarray, name: str) -> list[int]:
+    """The numbers of the markers of a set that a picture shows, in order."""
+    parameters, found = cv2.aruco.DetectorParameters(), []
+    # Kalibr draws the tags of its only set with a border of two bits.
+    for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
+        detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
+        numbers = detect(grey)[1]
+        found.append([] if numbers is None else [int(n) for n in numbers.ravel()])
+    return sorted(max(found, key=len))
+
+
 def _refined(grey: np.ndarray, grid: np.ndarray, board: Board) -> np.ndarray:
     """The grid with each corner where the gradients around it meet, in a window without edges of
-    other corners."""
-    px = pixels_per_unit(grid, board)
-    scale = 2 if np.fmin.reduce(px, axis=None) * board.reach < 6 else 1
+    other corners; NaN where squares meet elsewhere."""
+    room = _room(grid, board)
+    scale = 2 if np.fmin.reduce(room, axis=None) * board.reach < 6 else 1
     large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     best, end = grid.copy(), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
-    for at in zip(*np.nonzero(np.isfinite(px)), strict=True):
-        window = int(np.clip(px[at] * board.reach * scale, 2, 12))
+    for at in zip(*np.nonzero(np.isfinite(room)), strict=True):
+        window = int(np.clip(room[at] * board.reach * scale, 2, 12))
         place = ((grid[at] + 0.5) * scale - 0.5).astype(np.float32)[None]
         moved = cv2.cornerSubPix(large, place, (window, window), (-1, -1), end)[0]
         moved = (moved + 0.5) / scale - 0.5
-        if np.linalg.norm(moved - grid[at]) < 0.3 * px[at] * board.square:
+        if np.linalg.norm(moved - grid[at]) < 0.3 * room[at] * board.square:
             best[at] = moved
+    if board.kind != "april":  # whose corners are not between squares
+        radius = 0.875 * board.reach * room
+        best[(radius > RING) & (_unlike(grey, best, radius) > UNLIKE)] = np.nan
     return best
+
+
+def _room(grid: np.ndarray, board: Board) -> np.ndarray:
+    """(rows, columns): the smallest distance, px, between the sides of cells with the board's unit
+    of length around each corner, which is less than their length if they are slanted."""
+    least = pixels_per_unit(grid, board)
+    (down, _), (across, _) = _steps(grid, board, least)
+    across, (rows, columns) = across.swapaxes(0, 1), least.shape
+    for i, j in np.ndindex(2, 2):
+        a, b = across[i : rows - 1 + i], down[:, j : columns - 1 + j]
+        area = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        part = least[i : rows - 1 + i, j : columns - 1 + j]
+        np.fmin(part, area / np.linalg.norm([a, b], axis=-1).max(0), out=part)
+    return least
+
+
+def _unlike(grey: np.ndarray, grid: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """(rows, columns): how unlike the light is on opposite sides of each corner, at a radius px, as
+    a part of its range. It is alike where four squares meet, and not beside it."""
+    turn = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    ring = radius[..., None, None] * np.stack((np.cos(turn), np.sin(turn)), -1)
+    x, y = np.moveaxis(grid[:, :, None] + ring, -1, 0).astype(np.float32).reshape(2, -1, 32)
+    light = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    light = light.astype(np.float64).reshape(*radius.shape, 32)
+    apart = np.abs(light - np.roll(light, 16, -1)).mean(-1)
+    return apart / np.ptp(light, axis=-1).clip(1)
 
 
 def _steps(
@@ -345,7 +349,8 @@ def _turn(grid: np.ndarray) -> float:
     return float(np.nansum(ax * by - ay * bx))
 
 
-def _grey(picture: np.ndarray) -> np.ndarray:
+def grey_of(picture: np.ndarray) -> np.ndarray:
+    """(H, W): a picture without colours."""
     return np.ascontiguousarray(with_channels(np.atleast_3d(picture), 1)[..., 0])
 
 

@@ -33,8 +33,10 @@ class CalibratedLens:
         sigma: px: the standard deviation of a corner along one axis, from the median.
         error: px: the root mean square distance of corners from the lens, without those off it.
         left_out: px: the same in pictures that were left out, each fifth of them once; NaN for
-            fewer than 4 pictures.
+            fewer than 4 places of the board.
         supported: rad: the largest angle with corners around it.
+        unsure: rad: the standard deviation of 95 % of the rays up to there is no larger, after the
+            best rotation; by the noise of corners, or by leaving out one place of the board.
         parameters: the names of the n numbers that were found for the lens and for the board: its
             bend in x and in y, and its stretch.
         covariance: (n, n), theirs.
@@ -56,6 +58,7 @@ class CalibratedLens:
     error: float
     left_out: float
     supported: float
+    unsure: float
     parameters: list[str]
     covariance: Tensor
     models: list[tuple[str, float, float, str]]

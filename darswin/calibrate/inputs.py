@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate.refine import Views
+from darswin.calibrate.steady import places
 from darswin.utils.arrays import as_tensor
 from darswin.utils.parameters import check, naming
 
@@ -45,7 +46,8 @@ def checked(corners: Any, board: Any, size: tuple[int, int]) -> tuple[Views, Ten
             f"A board needs {LEAST_CORNERS} points or more, not on one line, got {len(points)}."
         )
     board = torch.nn.functional.pad(flat, (0, 1))
-    return Views(torch.where(seen[..., None], found, 0.0), seen, board), points
+    found = torch.where(seen[..., None], found, 0.0)
+    return Views(found, seen, board, places(found, seen)), points
 
 
 def _spans(points: Tensor, seen: Tensor, least: float) -> Tensor:

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from darswin.calibrate import edges
-from darswin.calibrate.boards import LEAST_SIDE, image_circle
+from darswin.calibrate.boards import LEAST_SIDE
+from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model

@@ -142,16 +142,17 @@ class State(NamedTuple):
 
 
 class Views(NamedTuple):
-    """What is calibrated from: corners (P, K, 2) px, 0 where not `seen`, (P, K), and the board's
-    points (K, 3), whose z is 0."""
+    """What is calibrated from: corners (P, K, 2) px, 0 where not `seen`, (P, K); the board's points
+    (K, 3), whose z is 0; and numbers (P,), equal for pictures that show it at one place."""
 
     corners: Tensor
     seen: Tensor
     board: Tensor
+    place: Tensor
 
     def of(self, which: Tensor) -> "Views":
         """Some of the pictures."""
-        return self._replace(corners=self.corners[which], seen=self.seen[which])
+        return Views(self.corners[which], self.seen[which], self.board, self.place[which])
 
     def shaped(self, shape: Tensor) -> Tensor:
         """(K, 3): the points of a board with a shape (3,)."""
@@ -228,12 +229,16 @@ class Normal:
         self.damping = damping * torch.eye(n).to(matrix)
         return self
 
-    def steps(self, left_out: bool = False) -> Tensor:
-        """(P, n + 6): the step of the lens, and that of each pose; `left_out`: of a lens without
-        the equations of the pose's picture."""
+    def steps(self, place: Tensor | None = None) -> Tensor:
+        """(P, n + 6): the step of the lens, and that of each pose; with `place`, (P,): of a lens
+        without the equations of all pictures of the pose's place."""
         matrix, side = self.lens.sum(0) + self.damping, self.lens_side.sum(0)
-        if left_out:
-            matrix, side = matrix - self.lens, side - self.lens_side
+        if place is not None:
+            own, own_side = (
+                torch.zeros_like(part).index_add(0, place, part)[place]
+                for part in (self.lens, self.lens_side)
+            )
+            matrix, side = matrix - own, side - own_side
         lens = (_inverse(matrix) @ side[..., None])[..., 0].expand_as(self.lens_side)
         poses = self.own + (self.follow @ lens[..., None])[..., 0]
         return self.scale * torch.cat((lens, poses), 1)

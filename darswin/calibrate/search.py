@@ -34,6 +34,7 @@ from darswin.calibrate.refine import (
     refine,
     weights_of,
 )
+from darswin.calibrate.steady import FEW, Steadiness, growth, unsure
 from darswin.lens import MODELS, Lens
 from darswin.lens.base import unknown_model
 from darswin.lens.files.load import reach
@@ -99,7 +100,7 @@ def calibrate(
     if terms is not None:
         check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
     usable = usable_pictures(whole, size, names)
-    views = whole._replace(corners=whole.corners[usable], seen=whole.seen[usable])
+    views = whole.of(usable)
     say(f"Finding a start from {len(views.seen)} pictures")
     start = radial.start(views.corners, views.seen, views.board[:, :2], size)
     found: list[_Found] = []
@@ -145,6 +146,7 @@ def calibrate(
 
     lens, seen = best.state.lens, views.seen
     supported = theta[best.fits(best.sigma)].quantile(0.99).item()
+    steady = best.steadiness(views, counts, supported)
     lens = lens.with_theta_max(reach(lens))
     result = CalibratedLens(
         lens=lens,
@@ -160,6 +162,7 @@ def calibrate(
         error=best.error,
         left_out=best.left_out,
         supported=supported,
+        unsure=max(steady.noise, steady.scatter),
         parameters=best.free.names,
         covariance=best.joint[:-3, :-3],
         models=table if model == "auto" else [],
@@ -168,7 +171,7 @@ def calibrate(
         _vector=best.state.vector,
         _joint=best.joint,
     )
-    result.doubts.extend(doubts(result, whole.seen, spot))
+    result.doubts.extend(doubts(result, whole.seen, spot, steady))
     result.doubts.extend(misshapen(result, best.state.shape, best.confounded))
     return result
 
@@ -205,20 +208,36 @@ class _Found:
 
     def judge(self, views: Views, counts: Tensor) -> None:
         """Computes the covariance and the errors, over the corners that count, (P, K)."""
+        place = views.place[counts.any(1)].unique(return_inverse=True)[1]
         miss, counts, slopes, normal = self._normal(views, counts, self.free)
         self.joint = self.sigma**2 * normal.covariance()
         self.error = miss[counts].square().sum(-1).mean().sqrt().item()
-        if len(miss) > LEAST_PICTURES:
-            moved = miss + (slopes @ normal.steps(left_out=True)[:, None, :, None])[..., 0]
+        if place.max() >= LEAST_PICTURES:
+            steps = normal.steps(place)
+            moved = miss + (slopes @ steps[:, None, :, None])[..., 0]
             self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
+
+    def steadiness(self, views: Views, counts: Tensor, top: float) -> Steadiness:
+        """Whether the pictures agree, over the corners that count, (P, K), up to an angle, rad."""
+        mine, n = views.of(counts.any(1)), len(self.state.vector)
+        place = mine.place.unique(return_inverse=True)[1]
+        miss, counts, slopes, normal = self._normal(views, counts, self.free)
+        without = miss.new_zeros(int(place.max()) + 1, n)
+        if len(without) >= FEW:
+            without[place] = normal.steps(place)[:, :n]
+        lens, noise = self.state.lens, self.joint[:n, :n]
+        spread = unsure(self.free, self.state.vector, lens, top, noise, without)
+        grown = growth(mine, lens, slopes, miss, counts, self.sigma)
+        return Steadiness(len(without), *spread, *grown)
 
     def leave_out(self, views: Views, counts: Tensor) -> None:
         """Computes `squares` (P,), the sums of the squared misses in each picture of a lens that
         was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
         pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
-        parts = [pictures[k::FOLDS] for k in range(min(FOLDS, len(pictures)))]
-        for part in parts if len(pictures) > LEAST_PICTURES else [pictures]:
+        place = views.place[pictures].unique(return_inverse=True)[1]
+        parts = [pictures[place % FOLDS == k] for k in range(min(FOLDS, int(place.max()) + 1))]
+        for part in parts if len(parts) > LEAST_PICTURES else [pictures]:
             rest = pictures[~torch.isin(pictures, part)]
             self.squares[part] = math.nan
             if len(rest) < LEAST_PICTURES:

@@ -38,7 +38,7 @@ def calibrate(
     marker: float | None = None, gap: float | None = None, dictionary: str | None = None,
     model: str = "auto", out: str = "camera.json", picture: str | None = None,
     report: str | None = None, format: Format | None = None, square_pixels: bool | None = None,
-    theta_max_deg: float | None = None,
+    theta_max_deg: float | None = None, first_tag: int | None = None,
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
@@ -56,6 +56,8 @@ def calibrate(
         gap: the gap between AprilTags, in the same unit.
         dictionary: the markers, as OpenCV names them. The default is 4X4_250 for ChArUco boards and
             APRILTAG_36h11 for AprilTags.
+        first_tag: the number of the first AprilTag, at the upper left, or at the lower left as
+            Kalibr draws them. The default is 0.
         model: the lens model, a name of darswin.lens.MODELS; or auto: of many that the file can
             hold, the simplest of those that predict left-out pictures best.
         out: the calibration to write.
@@ -69,10 +71,12 @@ def calibrate(
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
+    from darswin.calibrate.doubts import out_of_reach
     from darswin.cli.pictures import check_paths, pictures_and_videos
     from darswin.utils.progress import Progress
 
-    made = _board(kind, board, square, marker=marker, gap=gap, dictionary=dictionary)
+    given = {"marker": marker, "gap": gap, "dictionary": dictionary, "first_tag": first_tag}
+    made = _board(kind, board, square, **given)
     if model != "auto" and model not in darswin.lens.MODELS:
         raise ValueError(f"--model: {darswin.lens.base.unknown_model(model)}")
     if picture is not None:
@@ -106,7 +110,9 @@ def calibrate(
             progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
     lens = _within(seen.brightest, found.lens, theta_max_deg)
-    print(_summary(found, seen, lens))
+    rest = [text for text in found.doubts if text not in out_of_reach(found.supported, found.lens)]
+    doubts = [*seen.doubts, *rest, *out_of_reach(found.supported, lens)]
+    print(_summary(found, seen, doubts))
     try:
         write_lens(lens, out, format)
     except ValueError as error:  # the format holds none of the lenses
@@ -120,7 +126,7 @@ def calibrate(
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
-        entries["doubts"] = seen.doubts + found.doubts
+        entries["doubts"] = doubts
         replace_file(report, json.dumps(entries, indent=1))
         print(report)
     seen.broken.report()
@@ -162,7 +168,8 @@ def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":
     if needed and given[needed] is None:
         raise ValueError(f"--kind {kind} needs --{needed}")
     given = {name: value for name, value in given.items() if value is not None}
-    if needless := given.keys() - ({needed, "dictionary"} if needed else {}):
+    known = {"charuco": {"marker", "dictionary"}, "april": {"gap", "dictionary", "first_tag"}}
+    if needless := given.keys() - known.get(kind, set()):
         raise ValueError(f"--kind {kind} has no --{min(needless)}")
     make: Any = Board.april_grid if kind == "april" else getattr(Board, kind)
     return make(*sides, square, **given)
@@ -189,6 +196,7 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
 
     from darswin.calibrate import find_corners
     from darswin.calibrate.boards import edge_width, shown_instead
+    from darswin.calibrate.doubts import Note
     from darswin.cli.pictures import Broken
     from darswin.utils.image import as_stored, read_oriented
 
@@ -211,7 +219,7 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
                 f"all pictures must have one size: {first} has {one} (W×H) px, {name} has {other}"
             )
         if (same := known.setdefault(hash(image.tobytes()), name)) is not name:
-            doubts.append(f"{name} shows the same as {same}, and is left out")
+            doubts.append(Note(f"{name} shows the same as {same}, and is left out"))
             continue
         # Mirrored by the camera, whose pictures the others turn back.
         way = slice(None, None, -1 if sum(TURNS[read[1]]) % 2 else 1)
@@ -226,13 +234,13 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
             places = (image.shape[1] - 1, 0) + places * (-1, 1)
         corners[name] = places
     if without:
-        doubts.append(f"no board found in {_listed(without)}")
-        tried = [*without.values()][:TRIED]
+        words, tried = f"no board found in {_listed(without)}", [*without.values()][:TRIED]
         counts = Counter(filter(None, tried)).items()
         instead, count = max(counts, key=lambda item: item[::-1], default=("", 0))
         # Beside pictures with the board, others may show a part of it.
         if instead and (len(corners) < LEAST or 2 * count > len(tried)):
-            doubts[-1] += f": they show {instead}"
+            words += f": they show {instead}"
+        doubts.append((Note if len(without) <= len(corners) else str)(words))
     least = max(BLURRED[0], BLURRED[1] * float(np.median([*widths.values()] or [0])))
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
@@ -247,7 +255,7 @@ def _listed(names: Collection[str]) -> str:
 
 def _within(brightest: "np.ndarray", lens: Lens, degrees: float | None) -> Lens:
     """The lens with this θ_max, or that of the image circle, if the pictures have one."""
-    from darswin.calibrate.boards import image_circle
+    from darswin.calibrate.circle import image_circle
 
     if degrees is not None:
         limit = lens.with_theta_max(None).theta_max.item()
@@ -261,19 +269,9 @@ def _within(brightest: "np.ndarray", lens: Lens, degrees: float | None) -> Lens:
     return lens.with_theta_max(theta) if math.isfinite(theta) else lens
 
 
-def _label(doubt: str, seen: _Seen) -> str:
-    """ "note" for what is usual and taken care of; "looks wrong" for what the user must act on."""
-    usual = [
-        "corner ",
-        "corners reach",
-        *["no board found"] * (len(seen.without) <= len(seen.names)),
-    ]
-    parts = "and is left out", "more corners are off", "this is in", "this is taken into account"
-    is_usual = doubt.startswith(tuple(usual)) or any(part in doubt for part in parts)
-    return "note" if is_usual else "looks wrong"
+def _summary(found: "CalibratedLens", seen: _Seen, doubts: Sequence[str]) -> str:
+    from darswin.calibrate.doubts import Note
 
-
-def _summary(found: "CalibratedLens", seen: _Seen, lens: Lens) -> str:
     corners = int((found.weights > 0.1).sum())
     rows = [
         ("pictures", f"{int(found.used.sum())} of {seen.total}"),
@@ -281,7 +279,8 @@ def _summary(found: "CalibratedLens", seen: _Seen, lens: Lens) -> str:
         ("noise", f"{found.sigma:.3f} px along x and y"),
         ("left out", f"{found.left_out:.3f} px in pictures that were left out"),
         ("supported", f"up to {math.degrees(found.supported):.1f}° from the axis"),
-        *((_label(doubt, seen), doubt) for doubt in [*seen.doubts, *found.doubts]),
+        ("unsure", f"{math.degrees(found.unsure):.2g}° of the rays up to there"),
+        *(("note" if isinstance(doubt, Note) else "looks wrong", doubt) for doubt in doubts),
     ]
     lines = [f"{name:<16}{text}" for name, text in rows]
     if found.models:

@@ -15,6 +15,7 @@ from torch.testing import assert_close
 from darswin.calibrate import CalibrationError, calibrate
 from darswin.calibrate.doubts import doubts
 from darswin.calibrate.refine import Free, State, Views, refine
+from darswin.calibrate.steady import Steadiness, places
 from darswin.lens import MODELS, KannalaBrandt, from_dict, load, save
 from darswin.lens.solve import direction_of, vector_of
 
@@ -280,7 +281,7 @@ def test_left_out_is_the_error_of_pictures_that_were_left_out():
         flat = (true.board - true.board.mean(0)) / unit
         seen = ~true.corners[k : k + 1].isnan().any(-1)
         solid, middle = (torch.nn.functional.pad(p, (0, 1)) for p in (flat, true.board.mean(0)))
-        views = Views(true.corners[k : k + 1].nan_to_num(), seen, solid)
+        views = Views(true.corners[k : k + 1].nan_to_num(), seen, solid, torch.zeros(1).long())
         shift = (found.translations[k : k + 1] + found.rotations[k : k + 1] @ middle) / unit
         lens = rest.lens.with_theta_max(None)
         state = State(rest._vector, lens, found.rotations[k : k + 1], shift)
@@ -360,7 +361,8 @@ def test_the_best_model_that_is_accepted_is_taken(usual):
 
 
 def left_out_doubts(found, seen):
-    said = doubts(found, ~seen.corners.isnan().any(-1), seen.board.new_zeros(3))
+    steady = Steadiness(12, 0.0, 0.0, 0.0, 0.0)
+    said = doubts(found, ~seen.corners.isnan().any(-1), seen.board.new_zeros(3), steady)
     return [text for text in said if "that were left out are missed" in text]
 
 
@@ -378,3 +380,18 @@ def test_too_many_numbers_for_few_pictures_miss_those_left_out(model, noise):
     found = of(seen, model)
     assert (found.left_out > 2.5 * found.sigma) == (model == "Fisheye624")
     assert bool(left_out_doubts(found, seen)) == (found.left_out > 4 * found.sigma)
+
+
+def test_bursts_show_the_board_at_one_place(usual):
+    lens = rig(true_lens("KannalaBrandt", 190), 9)
+    g = torch.Generator().manual_seed(0)
+    burst = lens.corners[4:5] + 0.2 * torch.randn(10, 54, 2, generator=g, dtype=f64)
+    corners = torch.cat((lens.corners[:4], burst, lens.corners[5:]))
+    seen = ~corners.isnan().any(-1)
+    assert places(corners.nan_to_num(), seen).tolist() == [0, 1, 2, 3, *[4] * 10, 14, 15, 16, 17]
+    few = of(lens._replace(corners=corners[2:14]))
+    assert [t for t in few.doubts if t.startswith("12 pictures show the board at 3 places")]
+    many = of(lens._replace(corners=corners))
+    assert not [t for t in many.doubts if "places" in t]
+    # Leaving out a part of a burst says nothing: it is left out whole.
+    assert math.isnan(few.left_out) and many.left_out > many.error

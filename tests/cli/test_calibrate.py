@@ -251,6 +251,7 @@ def test_mirrored_pictures_are_told(folder, capsys):
         ([*BOARD, "--kind=april"], "--kind april needs --gap"),
         ([*BOARD, "--marker=0.1"], "--kind chessboard has no --marker"),
         ([*CHARUCO, "--gap=0.1"], "--kind charuco has no --gap"),
+        ([*CHARUCO, "--first_tag=3"], "--kind charuco has no --first_tag"),
         ([*BOARD, "--kind=charuco", "--marker=0.1"], "--marker must be below the square of 0.03"),
         ([*CHARUCO, "--dictionary=4X4_5"], "did you mean 4X4_50?"),
         ([*BOARD, "--dictionary=4X4_50"], "--kind chessboard has no --dictionary"),

@@ -40,7 +40,7 @@ def test_it_shows_corners_residuals_deviations_and_the_curve(made):
     middle = np.array(values.shape) // 2
     place = torch.tensor([[middle[1] + 0.5, middle[0] + 0.5]]).double() * 640 / 60 - 0.5
     assert values[tuple(middle)] == pytest.approx(found.uncertainty(place).item())
-    curve = panels["KannalaBrandt"].lines[0]
+    curve = panels[type(found.lens).__name__].lines[0]
     radii = found.lens.project(torch.deg2rad(torch.as_tensor(curve.get_xdata())))
     np.testing.assert_allclose(curve.get_ydata(), radii, rtol=1e-6)
 
