@@ -108,9 +108,9 @@ def calibrate(
     lens = _within(seen.brightest, found.lens, theta_max_deg)
     print(_summary(found, seen, lens))
     try:
-        write_lens(lens, out, format)
+        write_lens(lens, out, format, supported=found.supported)
     except ValueError as error:  # the format holds none of the lenses
-        write_lens(lens, f"{out}.json", "darswin")
+        write_lens(lens, f"{out}.json", "darswin", supported=found.supported)
         raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
         from darswin.viz.calibration import draw_calibration
@@ -138,15 +138,25 @@ def check_lens_out(out: str | None, inputs: Iterable[str], option: str = "out") 
             ) from error
 
 
-def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
-    """Writes the lens and prints what was written."""
-    written = darswin.lens.save(lens, out, format)
+def write_lens(
+    lens: Lens, out: str, format: Format | None, note: str = "", supported: float | None = None
+) -> None:
+    """Writes the lens and prints what was written; `supported` is that of `save`."""
+    written = darswin.lens.save(lens, out, format, supported=supported)
     degrees = math.degrees(lens.theta_max.item())
+    if supported is not None and written == "darswin":
+        note += f"; {supported_part(supported, lens)}"
     if written != "darswin" and bool(
         (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
     ):
         note += f"; {written} files have no θ_max: read it with --theta_max_deg {degrees:.2f}"
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
+
+
+def supported_part(supported: float, lens: Lens) -> str:
+    """How far corners support a lens, in words."""
+    part, whole = (math.degrees(angle) for angle in (supported, lens.theta_max.item()))
+    return f"corners support it up to {min(part, whole):.4g}° of {whole:.4g}°"
 
 
 def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":

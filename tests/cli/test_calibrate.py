@@ -83,7 +83,8 @@ def test_pictures_become_a_lens_a_figure_and_a_report(folder, capsys):
     report = json.loads((folder / "report.json").read_text())
     assert report["no_board"] == ["boards/wall.png"] and len(report["names"]) == 9
     assert np.array(report["residuals"]).shape == (9, 30, 2)
-    assert report["lens"] == json.loads((folder / "made.json").read_text())
+    written = report["lens"] | {"supported": report["supported"]}
+    assert written == json.loads((folder / "made.json").read_text())
     assert cv2.imread("made.png").shape[1] == 1200
     main(["lens", "show", "made.json", "boards/0.png", "--rings=4", "--sectors=8"])
 
