@@ -59,7 +59,8 @@ def calibrate(
         model: the lens model, a name of darswin.lens.MODELS; or auto: of many that the file can
             hold, the simplest of those that predict left-out pictures best.
         out: the calibration to write.
-        picture: a figure to write: the corners, what they miss, how sure the lens is.
+        picture: a figure to write: the corners, what they miss, how sure the lens is, and the
+            pictures whose corners are farthest off.
         report: a JSON file to write with all that was found.
         format: the format of the calibration, as for `darswin lens convert`.
         square_pixels: whether the camera's pixels are square. The default is to find the ratio of
@@ -113,10 +114,11 @@ def calibrate(
         write_lens(lens, f"{out}.json", "darswin", supported=found.supported)
         raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
+        from darswin.utils.image import read_stored
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
 
-        save_figure(draw_calibration(found, seen.corners, lens), picture)
+        save_figure(draw_calibration(found, lens, read_stored), picture)
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
@@ -156,7 +158,7 @@ def write_lens(
 def supported_part(supported: float, lens: Lens) -> str:
     """How far corners support a lens, in words."""
     part, whole = (math.degrees(angle) for angle in (supported, lens.theta_max.item()))
-    return f"corners support it up to {min(part, whole):.4g}° of {whole:.4g}°"
+    return f"corners support it up to {min(part, whole):.2f}° of {whole:.2f}°"
 
 
 def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":

@@ -70,16 +70,16 @@ def test_how_far_corners_support_a_lens_is_kept_and_shown(folder, capsys, monkey
         "crop made.json new.json --size 483,640",
     ):  # fmt: skip
         main(["lens", *arguments.split()])
-        assert "; corners support it up to 71.62° of 95°" in capsys.readouterr().out
+        assert "; corners support it up to 71.62° of 95.00°" in capsys.readouterr().out
         assert json.loads((folder / "new.json").read_text())["supported"] == 1.25
     main(["lens", "convert", "made.json", "new.yaml", "--model", "KannalaBrandt"])
     main(["lens", "convert", "new.yaml", "new.json"])
     assert "corners" not in capsys.readouterr().out
     assert "supported" not in json.loads((folder / "new.json").read_text())
     main(["lens", "info", "made.json"])
-    assert "supported       corners support it up to 71.62° of 95°\n" in capsys.readouterr().out
+    assert "supported       corners support it up to 71.62° of 95.00°\n" in capsys.readouterr().out
     main(["lens", "info", "made.json", "--theta_max_deg", "50"])
-    assert "corners support it up to 50° of 50°\n" in capsys.readouterr().out
+    assert "corners support it up to 50.00° of 50.00°\n" in capsys.readouterr().out
     main(["lens", "info", "front.json"])
     assert "corners support" not in capsys.readouterr().out
     drawn = []
