@@ -36,7 +36,7 @@ def draw_calibration(
     figure = page_figure(6.4 if read is None else 11.4)
     top: FigureBase = figure
     if read is not None:
-        top, below = figure.subfigures(2, 1, height_ratios=(6.4, 5.0))
+        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(6.4, 5.0)).flat
         _draw_worst(below, found, read)
     panels = top.subplot_mosaic([["corners", "residuals"], ["map", "curve"]])
     seen = ~torch.isnan(found.theta).numpy()
