@@ -25,6 +25,7 @@ class CalibratedLens:
             rotation @ board[k] + translation in the camera's frame, in the board's unit. NaN for
             pictures that show too few corners.
         board: (K, 3): its points as they were found: bent, and stretched along y, if that is sure.
+        corners: (P, K, 2) px: those that were given; NaN where not seen.
         residuals: (P, K, 2) px: the pixels of the lens minus the corners; NaN where not seen.
         weights: (P, K) in [0, 1]: how much each corner counts.
         theta: (P, K) rad: the angle of each corner; NaN where not seen.
@@ -49,6 +50,7 @@ class CalibratedLens:
     rotations: Tensor
     translations: Tensor
     board: Tensor
+    corners: Tensor
     residuals: Tensor
     weights: Tensor
     theta: Tensor

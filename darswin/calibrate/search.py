@@ -153,6 +153,7 @@ def calibrate(
         rotations=all_pictures(best.state.rotations),
         translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
         board=unit * views.shaped(best.state.shape) + spot,
+        corners=torch.where(whole.seen[..., None], whole.corners, torch.nan),
         residuals=all_pictures(torch.where(seen[..., None], miss, torch.nan)),
         weights=all_pictures(weights_of(miss, best.scale) * (seen & best.used[:, None]), 0.0),
         theta=all_pictures(torch.where(seen, theta, torch.nan)),

@@ -61,7 +61,8 @@ def calibrate(
         model: the lens model, a name of darswin.lens.MODELS; or auto: of many that the file can
             hold, the simplest of those that predict left-out pictures best.
         out: the calibration to write.
-        picture: a figure to write: the corners, what they miss, how sure the lens is.
+        picture: a figure to write: the corners, what they miss, how sure the lens is, and the
+            pictures whose corners are farthest off.
         report: a JSON file to write with all that was found.
         format: the format of the calibration, as for `darswin lens convert`.
         square_pixels: whether the camera's pixels are square. The default is to find the ratio of
@@ -114,15 +115,16 @@ def calibrate(
     doubts = [*seen.doubts, *rest, *out_of_reach(found.supported, lens)]
     print(_summary(found, seen, doubts))
     try:
-        write_lens(lens, out, format)
+        write_lens(lens, out, format, supported=found.supported)
     except ValueError as error:  # the format holds none of the lenses
-        write_lens(lens, f"{out}.json", "darswin")
+        write_lens(lens, f"{out}.json", "darswin", supported=found.supported)
         raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
+        from darswin.utils.image import read_stored
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
 
-        save_figure(draw_calibration(found, seen.corners, lens), picture)
+        save_figure(draw_calibration(found, lens, read_stored), picture)
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
@@ -144,15 +146,25 @@ def check_lens_out(out: str | None, inputs: Iterable[str], option: str = "out") 
             ) from error
 
 
-def write_lens(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
-    """Writes the lens and prints what was written."""
-    written = darswin.lens.save(lens, out, format)
+def write_lens(
+    lens: Lens, out: str, format: Format | None, note: str = "", supported: float | None = None
+) -> None:
+    """Writes the lens and prints what was written; `supported` is that of `save`."""
+    written = darswin.lens.save(lens, out, format, supported=supported)
     degrees = math.degrees(lens.theta_max.item())
+    if supported is not None and written == "darswin":
+        note += f"; {supported_part(supported, lens)}"
     if written != "darswin" and bool(
         (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
     ):
         note += f"; {written} files have no θ_max: read it with --theta_max_deg {degrees:.2f}"
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
+
+
+def supported_part(supported: float, lens: Lens) -> str:
+    """How far corners support a lens, in words."""
+    part, whole = (math.degrees(angle) for angle in (supported, lens.theta_max.item()))
+    return f"corners support it up to {min(part, whole):.2f}° of {whole:.2f}°"
 
 
 def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":

@@ -5,7 +5,7 @@ import math
 import torch
 
 from darswin.cli.arguments import check_out
-from darswin.cli.calibrate import Format, calibrate, check_lens_out, write_lens
+from darswin.cli.calibrate import Format, calibrate, check_lens_out, supported_part, write_lens
 from darswin.cli.estimate import estimate
 from darswin.cli.undistort import undistort
 from darswin.cli.views import Look, Up
@@ -74,7 +74,8 @@ def show(
     sampler = PolarView(rings, sectors, samples, spacing=spacing)
     fov_deg, view_size = look.shape(lens, size, VIEW_SIDE)
     title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"
-    save_figure(draw_lens(picture, lens, sampler, look.make(view_size, fov_deg), title), out)
+    shown = look.make(view_size, fov_deg)
+    save_figure(draw_lens(picture, lens, sampler, shown, title, file.supported()), out)
     print(out)
 
 
@@ -123,6 +124,8 @@ def info(
             listed = ", ".join(names) + ", …" * bool(more)
             rows.append(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {listed}")
         rows += [f"{'looks wrong':<16}{doubt}"] if doubt else []
+        if (supported := file.supported()) is not None:
+            rows.append(f"{'supported':<16}{supported_part(supported, lens)}")
         rows.append(describe(lens, rings=rings, sectors=sectors))
     print(*rows, sep="\n")
 
@@ -166,7 +169,7 @@ def convert(
         exact = lens
         lens, error = closest(model, exact, out, format)
         note = f", at most {error.item():.2g} px from {calib}{_dropped(lens, exact)}"
-    write_lens(lens, out, format, note)
+    write_lens(lens, out, format, note, file.supported())
 
 
 def _dropped(lens: Lens, exact: Lens) -> str:
@@ -216,7 +219,7 @@ def crop(
         lens = lens.cropped(*box)
     if size is not None:
         lens = lens.resized(size)
-    write_lens(lens, out, format, note)
+    write_lens(lens, out, format, note, file.supported())
 
 
 def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:

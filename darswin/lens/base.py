@@ -300,7 +300,7 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
             `MODELS` and the arguments of its constructor, rad and px. For models with a focal
             length, "fov" may replace "focal" and "theta_max": the full field of view, rad, which
             then fills the largest circle inside the image. "fov_deg" and "theta_max_deg" take
-            degrees.
+            degrees. "supported", which calibration files may have, is no part of the lens.
         image_size: (H, W) px of the lens's images, which "fov" requires.
 
     Raises:
@@ -309,6 +309,7 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
     if not isinstance(description, Mapping):
         raise ValueError(f"a lens must be a JSON object, got {description!r}")
     arguments = dict(description)
+    arguments.pop("supported", None)
     for in_degrees, angle in IN_DEGREES.items():
         if in_degrees in arguments:
             return _from_degrees(arguments, in_degrees, angle, image_size)

@@ -278,14 +278,16 @@ def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
 
 
 def draw_lens(
-    image: np.ndarray, lens: Lens, sampler: PolarView, view: PixelView, title: str = "undistorted"
-) -> Figure:
+    image: np.ndarray, lens: Lens, sampler: PolarView, view: PixelView, title: str = "undistorted",
+    supported: float | None = None,
+) -> Figure:  # fmt: skip
     """Draws a lens: partition, sample points, a view, polar image, projection curve.
 
     Args:
         image: (H, W) or (H, W, 3), uint8 or floats in [0, 1]. lens: one, of the image.
         sampler: how it is cut and sampled, as `model.view`.
         view: of one picture. title: of the view.
+        supported: rad: a circle where the corners of a calibration end; None draws none.
 
     Raises:
         ValueError: more than one lens.
@@ -317,6 +319,14 @@ def draw_lens(
         "polar": f"polar image, {rows * rings} × {columns * sectors} samples",
         "curve": f"projection: {type(lens).__name__}",
     }
+    if supported is not None and supported < lens.theta_max.item():
+        around = torch.linspace(0, 2 * math.pi, 361)
+        end = _one(lens).project_rays(supported, around, image.shape[:2])
+        effects = _outline(1.2, "black")
+        panels["partition"].plot(*end.T.numpy(), color="magenta", lw=1.2, path_effects=effects)
+        degrees = math.degrees(supported)
+        panels["curve"].axvline(degrees, color="magenta", lw=1)
+        titles["partition"] += f"\nmagenta: last corners, {degrees:.1f}°"
     for name, text in titles.items():
         panels[name].set_title(text, fontsize=TEXT)
     return figure

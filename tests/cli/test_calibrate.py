@@ -12,10 +12,11 @@ import pytest
 import torch
 from calibrate_boards import Renderer
 from helpers import slow_but
+from matplotlib.figure import Figure
 from PIL import ExifTags, Image
 
 from darswin import lens
-from darswin.calibrate import Board
+from darswin.calibrate import Board, find_corners
 from darswin.cli.main import main
 
 TRUE = lens.KannalaBrandt(
@@ -83,7 +84,11 @@ def test_pictures_become_a_lens_a_figure_and_a_report(folder, capsys):
     report = json.loads((folder / "report.json").read_text())
     assert report["no_board"] == ["boards/wall.png"] and len(report["names"]) == 9
     assert np.array(report["residuals"]).shape == (9, 30, 2)
-    assert report["lens"] == json.loads((folder / "made.json").read_text())
+    for name, corners in zip(report["names"], report["corners"], strict=True):
+        places = find_corners(cv2.imread(name, cv2.IMREAD_GRAYSCALE), Board.chessboard(6, 5, 0.03))
+        np.testing.assert_array_equal(corners, places)
+    written = report["lens"] | {"supported": report["supported"]}
+    assert written == json.loads((folder / "made.json").read_text())
     assert cv2.imread("made.png").shape[1] == 1200
     main(["lens", "show", "made.json", "boards/0.png", "--rings=4", "--sectors=8"])
 
@@ -102,14 +107,20 @@ def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypat
 
 
 @pytest.mark.parametrize("orientation", slow_but([2, 3, 5, 6, 8], 6, 8))
-def test_pixels_are_those_that_the_camera_stores(folder, capsys, orientation):
+def test_pixels_are_those_that_the_camera_stores(folder, capsys, monkeypatch, orientation):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     for k in range(0, 9, 2):
         Image.open(f"boards/{k}.png").save(f"boards/{k}.png", exif=exif)
-    calibrate("boards", *BOARD)
+    stored = cv2.imread("boards/4.png", cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR_RGB)
+    drawn = []
+    draw = "darswin.viz.calibration.draw_calibration"
+    monkeypatch.setattr(draw, lambda *given: drawn.append(given) or Figure((1, 1)))
+    calibrate("boards", *BOARD, "--picture=made.png")
     assert "pictures        9 of 9" in capsys.readouterr().out
     assert_is_true(lens.load("camera.json", dtype=torch.float64))
+    ((found, _, read),) = drawn
+    np.testing.assert_array_equal(read(found.names[4]), stored)
 
 
 def test_markers_are_found_in_pictures_that_the_camera_mirrors(folder, capsys):

@@ -62,6 +62,34 @@ def test_convert_fits_and_writes(folder, capsys):
     assert json.loads(out.read_text())["model"] == "Polynomial"
 
 
+def test_how_far_corners_support_a_lens_is_kept_and_shown(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "made.json").write_text(json.dumps(to_dict(FRONT) | {"supported": 1.25}))
+    for arguments in (
+        "convert made.json new.json", "convert made.json new.json --model KannalaBrandt",
+        "crop made.json new.json --size 483,640",
+    ):  # fmt: skip
+        main(["lens", *arguments.split()])
+        assert "; corners support it up to 71.62° of 95.00°" in capsys.readouterr().out
+        assert json.loads((folder / "new.json").read_text())["supported"] == 1.25
+    main(["lens", "convert", "made.json", "new.yaml", "--model", "KannalaBrandt"])
+    main(["lens", "convert", "new.yaml", "new.json"])
+    assert "corners" not in capsys.readouterr().out
+    assert "supported" not in json.loads((folder / "new.json").read_text())
+    main(["lens", "info", "made.json"])
+    assert "supported       corners support it up to 71.62° of 95.00°\n" in capsys.readouterr().out
+    main(["lens", "info", "made.json", "--theta_max_deg", "50"])
+    assert "corners support it up to 50.00° of 50.00°\n" in capsys.readouterr().out
+    main(["lens", "info", "front.json"])
+    assert "corners support" not in capsys.readouterr().out
+    drawn = []
+    monkeypatch.setattr(plot, "draw_lens", lambda *arguments: drawn.append(arguments[-1]))
+    monkeypatch.setattr(plot, "save_figure", lambda figure, out: None)
+    for name in ("made", "front"):
+        main(["lens", "show", f"{name}.json", "front.png"])
+    assert drawn == [1.25, None]
+
+
 def refusal(capsys, *arguments):
     """The one line with which a command refuses its arguments, with exit code 2."""
     with pytest.raises(SystemExit) as end:
@@ -177,7 +205,7 @@ def test_views_stay_small(folder, monkeypatch, view):
             main(["lens", "show", str(folder / "flat.json"), str(folder / "flat.png"), "--view",
                   view, f"--yaw_deg={yaw}", f"--pitch_deg={pitch}", "--fov_deg", fov])  # fmt: skip
     assert len(found) == 12
-    for _, shown, title in found:
+    for _, shown, title, _ in found:
         assert max(shown.size) == 800 and f"yaw {yaw}°, pitch {pitch}°" in title
 
 
@@ -254,7 +282,7 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
     for name, value in options:
         argv += [f"--{name}", *value.split()] if apart else [f"--{name}={value}"]
 
-    def draw(image, lens, sampler, view, title):
+    def draw(image, lens, sampler, view, title, supported):
         assert math.prod(view.size) <= 800**2 and len(title) < 100
         assert sampler.rings * sampler.sectors * math.prod(sampler.samples) <= 2**22
 

@@ -64,7 +64,7 @@ def draw_lens() -> Figure:
 def draw_calibrated() -> Figure:
     made = rig(true_lens("KannalaBrandt", 190, LABELS.shape), 8, noise=0.05)
     found = calibrate(made.corners, made.board, made.size)
-    return draw_calibration(found, made.corners.numpy(), found.lens)
+    return draw_calibration(found, found.lens, lambda name: PICTURE)
 
 
 def draw_demo() -> Figure:

@@ -1,5 +1,6 @@
 """Files written in the formats of OpenCV, COLMAP, Kalibr and our own hold the same lens."""
 
+import json
 from itertools import product
 
 import cv2
@@ -14,8 +15,9 @@ from lens_examples import ASIDE, FILES, assert_projects, double, example, f64, p
 from torch.testing import assert_close
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Spherical, load, load_all, save
+from darswin.lens import MODELS, Spherical, from_dict, load, load_all, save, to_dict
 from darswin.lens.curves import as_curves
+from darswin.lens.files.load import Calibration
 
 FORMATS = {"opencv": (".yaml", ".xml", ".json"), "colmap": (".txt",), "kalibr": (".yaml",)}
 
@@ -85,6 +87,23 @@ def test_our_own_json_is_the_lens_to_the_bit(name, tmp_path):
         save(used, path)
         assert load(path, dtype=dtype).same_as(used)
         assert_close(load(path, dtype=other).theta_max, used.theta_max.to(other), rtol=0, atol=1e-4)
+
+
+def test_our_own_json_alone_keeps_how_far_corners_support_the_lens(tmp_path):
+    lens, path = Spherical(0.5, 300.0, 1.5, image_size=(480, 640)), tmp_path / "lens.json"
+    assert save(lens, path, supported=1.2) == "darswin"
+    assert Calibration.read(path).supported() == 1.2
+    content = json.loads(path.read_text())
+    assert load(path).same_as(lens) and from_dict(content).same_as(lens)
+    assert {k: v for k, v in content.items() if k not in to_dict(lens)} == {"supported": 1.2}
+    refused("supported must be above 0 and at most 3.142 rad, got 71", save, lens, path,
+            supported=71)  # fmt: skip
+    assert json.loads(path.read_text()) == content
+    for form, name in (("darswin", "other.json"), ("opencv", "plain.json")):
+        save(lens, tmp_path / name, form)
+        assert Calibration.read(tmp_path / name).supported() is None
+    save(lens, path, "opencv", supported=1.2)
+    assert path.read_text() == (tmp_path / "plain.json").read_text()
 
 
 # The formats that hold each camera; ours holds all.

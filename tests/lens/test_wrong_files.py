@@ -263,6 +263,8 @@ TEXTS = (
     (spherical(fov_deg=170, theta_max_deg=80), "a Spherical lens has no theta_max_deg"),
     (spherical(fov_deg=170, focal=80), ("fov_deg takes the place of focal, ", "theta_max")),
     (equidistant(fov=1.7), ("fov takes the place of focal, ", "theta_max is half of fov")),
+    (equidistant(supported=71), "supported must be above 0 and at most 3.142 rad, got 71"),
+    (equidistant(supported="wide"), "supported must be above 0 and at most 3.142 rad, got 'wide'"),
     (ours("Orthographic", fov_deg=200),
      ("fov_deg is 200, but fov must be at most 3.14", " rad (1", "°)")),
     (ours("Orthographic", focal=9, theta_max_deg=100),

@@ -176,6 +176,18 @@ def test_draw_lens_has_all_panels(tmp_path):
         assert path.read_bytes().startswith(heads[format_])
 
 
+def test_draw_lens_draws_a_circle_where_corners_end():
+    image, lens = np.zeros((48, 64, 3), np.uint8), KannalaBrandt(20.0, [0.01], 1.7)
+    view, around = make_view("perspective", (6, 8), fov=1.0), torch.linspace(0, 2 * math.pi, 361)
+    for supported, count in ((1.2, 1), (1.71, 0)):
+        axes = draw_lens(image, lens, SAMPLER, view, "ahead", supported).axes
+        drawn = [line for line in axes[0].lines if line.get_color() == "magenta"]
+        assert len(drawn) == count == axes[0].get_title().count("last corners, 68.8°")
+        for line in drawn:
+            expected = lens.project_rays(1.2, around, (48, 64))
+            torch.testing.assert_close(torch.tensor(line.get_xydata()).float(), expected)
+
+
 def test_a_palette_makes_a_png_small_and_keeps_its_size(tmp_path):
     figure = Figure(figsize=(2, 1))
     figure.subplots().imshow(np.random.default_rng(0).random((9, 9)))

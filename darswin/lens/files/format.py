@@ -73,8 +73,13 @@ class Format:
         """The direction away from gravity in the camera's frame, by the file's extrinsics."""
         raise ValueError(f"{self.name} files do not say which way is up in the camera's frame")
 
-    def write(self, lens: Lens, suffix: str) -> str:
-        """The text of a file with this suffix; ValueError if the format cannot hold the lens."""
+    def supported(self, file: Any) -> float | None:
+        """rad: the angle up to which corners support the lens, or None if the file does not say."""
+        return None
+
+    def write(self, lens: Lens, suffix: str, supported: float | None = None) -> str:
+        """The text of a file with this suffix; ValueError if the format cannot hold the lens. Our
+        own alone has a place for `supported`."""
         camera = intrinsics_of(lens, self.origin)
         if camera is not None and camera.size is None and self.needs_size:
             raise ValueError(f"{self.name} files need the lens's image_size, but it has none")

@@ -151,6 +151,11 @@ class Calibration:
             x, y, z = self.format.up(self._fields)
         return x, y, z
 
+    def supported(self) -> float | None:
+        """rad: the angle up to which corners support the lens, or None if the file does not say. It
+        holds for crops of the camera's pictures, and for a lens of another model fitted to it."""
+        return self.format.supported(self._fields)
+
     def has_several(self) -> bool:
         """True if its cameras are not all the same."""
         first = self._describe(self.names[0]) if len(self.names) > 1 else None

@@ -1,6 +1,7 @@
 """Our own JSON: the name of a lens model and the arguments of its constructor.
 
-Angles may be in degrees: `theta_max_deg`, and `fov_deg` in place of `fov`.
+Angles may be in degrees: `theta_max_deg`, and `fov_deg` in place of `fov`. Beside the lens, a file
+may say up to which angle corners support it.
 """
 
 import json
@@ -36,10 +37,21 @@ class Own(Format):
         return not others or not others.isdisjoint(known)
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
+        self.supported(file)  # a wrong one is an error
         return {"lens": lambda: _lens(file)}
 
-    def write(self, lens: Lens, suffix: str) -> str:
-        return json.dumps(to_dict(lens), indent=2, allow_nan=False) + "\n"
+    def supported(self, file: Fields) -> float | None:
+        if "supported" not in file:
+            return None
+        expected = f"above 0 and at most {math.pi:.4g} rad"
+        value = file.get("supported", expected)
+        return to_number(value, file.path("supported"), expected, lambda x: 0 < x <= math.pi)
+
+    def write(self, lens: Lens, suffix: str, supported: float | None = None) -> str:
+        said = {} if supported is None else {"supported": float(supported)}
+        if said:
+            self.supported(Fields(said))
+        return json.dumps(to_dict(lens) | said, indent=2, allow_nan=False) + "\n"
 
 
 def _lens(file: Fields) -> Description:
@@ -58,7 +70,7 @@ def _lens(file: Fields) -> Description:
     known = [*required, *optional]
     known += [key for key, angle in IN_DEGREES.items() if angle in known]
     for key in file.entries:
-        if key not in ("model", *known):
+        if key not in ("model", "supported", *known):
             raise ValueError(f"a {name} lens has no {file.path(key)}, only {', '.join(known)}")
     angles: dict[str, float] = {}
     for in_degrees, angle in IN_DEGREES.items():

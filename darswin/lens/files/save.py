@@ -23,7 +23,13 @@ WRITTEN: dict[str, Format] = {
 }  # fmt: skip
 
 
-def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
+def save(
+    lens: Lens,
+    path: str | os.PathLike,
+    format: str | None = None,
+    *,
+    supported: float | None = None,
+) -> str:
     """Writes one lens to a file that `load` reads, and returns the name of the format.
 
     Our own JSON holds any lens. The other formats hold the lenses of their own models, without
@@ -33,13 +39,15 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
         format: "darswin", "opencv", "colmap" or "kalibr". None chooses by the path: OpenCV for
             .xml, .yaml and .yml, but Kalibr if the name contains "camchain" or "kalibr"; COLMAP
             for .txt; else our own JSON.
+        supported: rad: the angle up to which corners support the lens, as `CalibratedLens` has it.
+            Our own JSON keeps it beside the lens; other formats have no place for it.
 
     Raises:
-        ValueError: several lenses, a lens of a model that is not in `MODELS`, or a lens that the
-            format cannot hold exactly.
+        ValueError: several lenses, a lens of a model that is not in `MODELS`, a lens that the
+            format cannot hold exactly, or a wrong angle.
     """
     format = format_of(path, format)
-    replace_file(path, WRITTEN[format].write(lens, Path(path).suffix.lower()))
+    replace_file(path, WRITTEN[format].write(lens, Path(path).suffix.lower(), supported))
     return format
 
 
