@@ -12,6 +12,7 @@ from torch import Tensor
 from darswin.lens.image import LensInImage, Size
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of, vector_of
+from darswin.ops._library import no_gradients
 from darswin.utils.arrays import as_tensor
 from darswin.utils.nearest import did_you_mean
 
@@ -151,8 +152,10 @@ class Lens(LensInImage):
         """
         (radius,) = self._aligned(radius)
         slack = 1 + 16 * torch.finfo(radius.dtype).eps
-        with torch.no_grad():
-            last, beyond = self.r_max, self.project(self.theta_max * slack)
+        with no_gradients():
+            # In one call, which may be a search.
+            ends = torch.stack((self.theta_max, self.theta_max * slack), 1)
+            last, beyond = self.project(ends).unbind(1)
             # A little beyond θ_max, a model may have no radius or a smaller one.
             last = torch.where(beyond > last, beyond, last) * slack
             lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))

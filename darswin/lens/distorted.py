@@ -27,6 +27,7 @@ from darswin.lens.solve import (
     solve,
 )
 from darswin.lens.sphere import XI_STARTS, Spherical, sphere_angle, sphere_limit
+from darswin.ops._library import no_gradients
 from darswin.ops.checks import readable
 
 
@@ -205,7 +206,7 @@ class DistortedLens(FocalLens, register=False):
         `inverse`, the last steps carry the gradients."""
         end = self._row(self.theta_max.detach(), theta.dim())
         goal = flat / self._row(self.focal, flat.dim())
-        with torch.no_grad():
+        with no_gradients():
             last = self._plane(end)
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
             point = self._find_points(goal, start, last)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch._higher_order_ops.while_loop import while_loop
 from torch.autograd import forward_ad
 
-from darswin.ops._library import transformed
+from darswin.ops._library import no_gradients, transformed
 from darswin.ops.checks import readable
 
 Function = Callable[[Tensor], Tensor]
@@ -28,7 +28,7 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     inverse, to `value` and to the tensors that `function` and `slope` use: each step doubles the
     order of the error, so derivatives up to the third are exact.
     """
-    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+    with no_gradients(), forward_ad._set_fwd_grad_enabled(False):
         low, high, x = _brackets(function, value, end)
         eps = torch.finfo(x.dtype).eps
         # After a Newton step of this length, x is exact to rounding.
@@ -111,7 +111,7 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
         value = slope(x)
         return (value > 0) & (value < torch.inf)
 
-    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+    with no_gradients(), forward_ad._set_fwd_grad_enabled(False):
         low, high = torch.zeros_like(end)[:, None], end[:, None]
         for steps in (1024, *[32] * 10):  # down to rounding
             parts = torch.linspace(0, 1, steps + 1, dtype=end.dtype, device=end.device)

@@ -9,6 +9,7 @@ from torch import Tensor
 from darswin.lens.base import MARGIN
 from darswin.lens.ideal import FocalLens
 from darswin.lens.parameter import Number, Parameter
+from darswin.ops._library import no_gradients
 
 # Initial values for `fit`.
 XI_STARTS = (1.0, -0.2, 0.5, 2.0)
@@ -161,7 +162,7 @@ def sphere_angle(rho: Tensor, xi: Tensor) -> Tensor:
 
 def sphere_limit(xi: Tensor) -> Tensor:
     """The θ up to which sin θ / (ξ + cos θ) rises."""
-    with torch.no_grad():
+    with no_gradients():
         return torch.acos(-torch.minimum(xi, xi.reciprocal())) - MARGIN
 
 

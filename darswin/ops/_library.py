@@ -39,6 +39,12 @@ def reference_in_use() -> bool:
     return _reference
 
 
+def no_gradients() -> contextlib.AbstractContextManager[None]:
+    """`torch.no_grad()` where gradients are recorded. Elsewhere it does nothing: a graph would be
+    taken apart there, which takes seconds to export."""
+    return torch.no_grad() if torch.is_grad_enabled() else contextlib.nullcontext()
+
+
 def operator(name: str) -> Any:
     """An operator of the compiled module. Without the module, it refuses calls."""
     if _module.LACK is not None:

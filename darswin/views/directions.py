@@ -11,6 +11,7 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, ray_channels
 from darswin.lens.solve import repeated
+from darswin.ops._library import no_gradients
 from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel, check_lens, in_full_precision
@@ -195,13 +196,16 @@ class RayView(PixelView):
 
     # -- what the view covers -----------------------------------------------------------------
 
-    @torch.no_grad()
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
         1, 2)."""
         if self._known is not None:
             return self._known
-        lens = lens.detach()
+        with no_gradients():
+            return self._covered(lens.detach(), size)
+
+    def _covered(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        """`_layout`, from where the lens sees."""
         start = self._start(lens.theta_max)
         if self.fov is not None:
             return start.new_tensor([[2 * self.half_width(self.fov / 2) / self.size[1]]]), start

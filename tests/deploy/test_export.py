@@ -9,6 +9,7 @@ import zipfile
 import pytest
 import torch
 from helpers import create
+from lens_examples import example
 
 from darswin import create_model
 from darswin.compat import OfficialDarSwin
@@ -241,6 +242,16 @@ def test_the_nodes_that_solve_for_the_rays_of_pixels(loops, monkeypatch):
     assert loops == any("while_loop" in node.name for node in program.graph.nodes)
     assert len(program.graph.nodes) <= (320 if loops else 600)
     torch.testing.assert_close(program.module()(images, **tensors), model(images, lens))
+
+
+@pytest.mark.slow
+def test_a_graph_searches_once_for_the_end_of_a_lens_and_keeps_no_stack_traces():
+    lens = example("OCam", torch.Generator().manual_seed(0))[:1]
+    model, images = short("conv_unet_nano", widths=(4,)), torch.rand(1, 3, 32, 32)
+    nodes = export_program(model, images, lens).graph.nodes
+    assert [node.op for node in nodes if str(node.target) == "while_loop"] == ["call_function"]
+    assert sum(bool(node.stack_trace) for node in nodes) <= 1  # the batch size has its own
+    assert not torch.fx.config.do_not_emit_stack_traces
 
 
 @pytest.mark.slow

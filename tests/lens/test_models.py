@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import product, refused, slow_but
 from lens_examples import ASIDE, RANDOM, double, example, f64, random_lens
+from torch.fx.experimental.proxy_tensor import make_fx
 from torch.testing import assert_close
 
 from darswin.lens import (
@@ -350,3 +351,14 @@ def test_an_image_is_solved_as_its_rows_are(name, precision, monkeypatch):
                     for x in (image, rows)
                 )  # fmt: skip
                 close(*slopes, 100 * bound)
+
+
+def test_where_no_gradients_are_recorded_a_lens_does_not_switch_them_off():
+    # An export would take its graph apart there, and put it together again.
+    lens, radius = Spherical.from_fov(0.5, 2.6, 16.0), torch.rand(1, 5, requires_grad=True)
+    assert lens.unproject(radius).requires_grad
+    for switch, count in ((torch.enable_grad, 2), (torch.no_grad, 0)):
+        with switch():
+            graph = make_fx(lambda x: lens.unproject(x), pre_dispatch=True)(radius).graph
+        switched = [node for node in graph.nodes if "set_grad_enabled" in str(node.target)]
+        assert len(switched) == count
