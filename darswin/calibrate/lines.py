@@ -95,10 +95,8 @@ def estimate(
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
         raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
-    if min(min(sizes)) < boards.LEAST_SIDE:
-        raise ValueError(
-            f"pictures must have at least {boards.LEAST_SIDE} × {boards.LEAST_SIDE} px"
-        )
+    if min(min(sizes)) < (least := boards.LEAST_SIDE):
+        raise ValueError(f"pictures must have at least {least} × {least} px")
     circle = image_circle(pictures)
     if fov is not None and circle is None:
         raise CalibrationError("no image circle is visible, so its field of view says nothing")
