@@ -277,13 +277,14 @@ def _collected(
 
 def _numbers(grey: np.ndarray, name: str) -> list[int]:
     """The numbers of the markers of a set that a picture shows, in order."""
-    parameters, found = cv2.aruco.DetectorParameters(), []
+    parameters, found = cv2.aruco.DetectorParameters(), list[list[int]]()
     # Kalibr draws the tags of its only set with a border of two bits.
     for parameters.markerBorderBits in (1, 2) if name == "APRILTAG_36h11" else (1,):
         detect = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers
         numbers = detect(grey)[1]
         found.append([] if numbers is None else [int(n) for n in numbers.ravel()])
-    return sorted(max(found, key=len))
+    most: list[int] = max(found, key=len)
+    return sorted(most)
 
 
 def _refined(grey: np.ndarray, grid: np.ndarray, board: Board) -> np.ndarray:

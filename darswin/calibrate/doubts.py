@@ -12,7 +12,7 @@ from darswin.calibrate.steady import FEW, Steadiness
 from darswin.lens import Lens
 
 UNSURE, UNKNOWN = 0.1, 2.0  # degrees: the standard deviation of rays
-DISAGREE = 3.0  # times that by the noise: pictures that differ; then, half of UNSURE is too much
+DISAGREE, APART = 3.0, 0.06  # times that by the noise, for pictures that differ; degrees
 GROWN, SURE = 0.003, 4.0  # of the scale; standard deviations
 BLURRED, PARALLEL = 1.0, 12.0  # px; degrees
 WRONG = 0.02  # of the picture's side: a corner's standard deviation
@@ -40,9 +40,10 @@ def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadine
             f"Half of the corners are {MEDIAN * found.sigma:.3g} px or more off the best lens: are "
             "the board and the order of its corners right?"
         )
-    unsure = math.degrees(found.unsure) * max(1.0, SHARPEST / max(found.sigma, 1e-12))
-    disagree = steady.scatter > DISAGREE * steady.noise
-    if not unsure <= UNSURE / (1 + disagree):
+    noise = math.degrees(steady.noise) * max(1.0, SHARPEST / max(found.sigma, 1e-12))
+    scatter = math.degrees(steady.scatter)
+    unsure, disagree = max(noise, scatter), scatter > DISAGREE * noise
+    if not unsure <= (APART if disagree else UNSURE):
         tilt = torch.acos(rotations[:, 2, 2].abs().clamp(max=1)).max().rad2deg()
         why = "take more pictures, with tilted boards that fill more of the picture"
         if disagree:

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from darswin.calibrate import edges
-from darswin.calibrate.boards import LEAST_SIDE
+from darswin.calibrate import boards, edges
 from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
 from darswin.lens import OCam, fit, to_dict
@@ -96,8 +95,8 @@ def estimate(
     if len(sizes) != 1:
         found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
         raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
-    if min(min(sizes)) < LEAST_SIDE:
-        raise ValueError(f"pictures must have at least {LEAST_SIDE} × {LEAST_SIDE} px")
+    if min(min(sizes)) < (least := boards.LEAST_SIDE):
+        raise ValueError(f"pictures must have at least {least} × {least} px")
     circle = image_circle(pictures)
     if fov is not None and circle is None:
         raise CalibrationError("no image circle is visible, so its field of view says nothing")

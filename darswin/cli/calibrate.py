@@ -216,7 +216,8 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
     widths: dict[str, float] = {}
     without: dict[str, str] = {}  # the board, and what they show instead
     known: dict[int, str] = {}
-    first, brightest, doubts, broken = "", np.zeros((1, 1, 1), np.uint8), [], Broken()
+    first, brightest, broken = "", np.zeros((1, 1, 1), np.uint8), Broken()
+    doubts: list[str] = []
     for progress.done, name in enumerate(files):
         image = None
         with broken.skipped():

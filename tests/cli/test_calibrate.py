@@ -219,6 +219,19 @@ def test_a_blurred_board_is_named(folder, capsys):
 
 
 @pytest.mark.slow
+def test_a_zoom_that_changes_looks_wrong(folder, capsys):
+    words = "looks wrong     (.* pictures disagree|the scale changes by .[5-9])"
+    calibrate("boards", *BOARD)
+    assert not re.search(words, capsys.readouterr().out)
+    for k in range(5, 9):
+        picture = cv2.imread(f"boards/{k}.png")
+        near = cv2.resize(picture, None, fx=1.05, fy=1.05, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(f"boards/{k}.png", near[8:-8, 9:-9])
+    calibrate("boards", *BOARD)
+    assert re.search(words, capsys.readouterr().out)
+
+
+@pytest.mark.slow
 def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     some = [f"boards/{k}.png" for k in (0, 1)]
     line = refusal(capsys, *some, "--board=7x4", "--square=1")
