@@ -20,6 +20,8 @@ import torch
 from darswin.calibrate import boards, edges
 from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
+from darswin.calibrate.spread import RHO, USUAL, angles, misfit
+from darswin.calibrate.spread import deviation as _deviation
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
@@ -33,8 +35,6 @@ STRAIGHT = 3.0  # times TOLERANCE: curves that miss by more are not lines
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
 LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
-USUAL = 10.0  # the weight of what usual lenses are like
-GROUPS = 8  # of curves; the answers without each of them show the uncertainty
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
@@ -49,6 +49,7 @@ class Estimate:
         lens: one lens in float64.
         rim: rad, its θ at `radius`, px: at the image circle, or at the nearest side without one.
         interval: rad: the least and the largest θ at the rim, one standard deviation around it.
+        spread: the largest standard deviation of θ up to the rim, as a part of θ.
         curves: the number of curves that are straight with this lens.
         covered: the part of the radius, in [0, 1], on which they lie.
         verdict: what supports the lens, in one sentence; doubts: sentences on what does not.
@@ -58,10 +59,17 @@ class Estimate:
     rim: float
     radius: float
     interval: tuple[float, float]
+    spread: float
     curves: int
     covered: float
     verdict: str
     doubts: tuple[str, ...]
+
+    @property
+    def is_sure(self) -> bool:
+        """False if the pictures allow very different lenses."""
+        low, high = self.interval
+        return high - low <= 2 * UNSURE * self.rim
 
     def to_dict(self) -> dict[str, Any]:
         """All of it as a JSON object; the lens is described as by `darswin.lens.to_dict`."""
@@ -144,7 +152,8 @@ def from_curves(
     kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
     for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
         with suppress(ValueError):
-            lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
+            shown = raw.with_theta_max(part * theta)
+            lens, error = fit(kind, shown, terms=terms)
             break
     else:
         raise CalibrationError(
@@ -155,8 +164,9 @@ def from_curves(
     if rim < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigma = math.hypot(0.0 if fov else _deviation(found), rim - best.rim)
-    low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
+    sigmas = np.hypot(0.0 if fov else _deviation(found), misfit(lens, shown, radius))
+    low, high = max(rim - sigmas[-1], 0.0), min(rim + sigmas[-1], math.pi)
+    spread = float((sigmas / angles(lens, radius)).max())
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
     oriented = (second >= SECOND[0]).sum()
     source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
@@ -164,17 +174,19 @@ def from_curves(
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
+        + f", and known to {spread:.1%} at any radius below"
     )
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        "the pictures allow very different lenses: give more of them": sigma > UNSURE * rim,
+        "the pictures allow very different lenses: give more of them": sigmas[-1] > UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
     }
     said = tuple(doubt for doubt, holds in doubts.items() if holds)
-    return Estimate(lens, rim, radius, (low, high), len(best.normal), covered, verdict, said)
+    count = len(best.normal)
+    return Estimate(lens, rim, radius, (low, high), spread, count, covered, verdict, said)
 
 
 def _check(count: int) -> None:
@@ -244,7 +256,7 @@ class _Seen:
     """
 
     def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | float = 1.0):
-        self.lines, self.v, self.rim = lines, v, _rim(v)
+        self.lines, self.v, self.rim, self.curve = lines, v, _rim(v), _angles(v, RHO)[0]
         offset = lines.points - v[4:]
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
@@ -379,22 +391,3 @@ def _search(lines: _Lines) -> list[_Seen]:
         fits = [min(fit, _Seen(lines, fit.v).orient(), key=_cost) for fit in fits]
     least = min(map(_cost, fits))
     return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)
-
-
-def _deviation(fits: list[_Seen]) -> float:
-    """The standard deviation of the rim, rad: by the jackknife over groups of neighbouring curves,
-    whose errors are alike, and by other beliefs on usual lenses and on the centre."""
-    lines, best = fits[0].lines, fits[0]
-
-    def rim(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> float:
-        some = lines.some(keep, belief)
-        return min((_Seen(some, f.v).orient(f.axes).refined(8) for f in fits), key=_cost).rim
-
-    x, y = np.array([piece.mean(0) for piece in lines.pieces]).T - best.v[4:, None]
-    group = np.empty(len(x), int)
-    group[np.lexsort((np.arctan2(y, x), lines.picture))] = np.arange(len(x)) * GROUPS // len(x)
-    without = [rim(group != k) for k in range(GROUPS)]
-    # How far lenses differ from `usual` ones and their centres from the middle.
-    beliefs = np.diag((0.5 * USUAL, 0.5 * USUAL, 0.4 * USUAL, 5, 5, 0))[:5]
-    changes = [rim(group >= 0, belief) - best.rim for belief in beliefs]
-    return math.sqrt((GROUPS - 1) * np.var(without) + np.square(changes).sum())

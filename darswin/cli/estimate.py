@@ -14,7 +14,7 @@ from darswin.utils.parameters import check
 def estimate(
     pictures: Sequence[str] = (), *, out: str | None = None, model: str = "Spherical",
     fov_deg: float | None = None, center: tuple[float, float] | None = None,
-    report: str | None = None,
+    report: str | None = None, accept_doubts: bool = False,
 ) -> None:  # fmt: skip
     """Estimates a lens from pictures of rooms, houses or streets, without a board.
 
@@ -27,6 +27,8 @@ def estimate(
         fov_deg: the field of view of the visible image circle in degrees, if you know it.
         center: the principal point x,y in px, if you know it. The default is near the middle.
         report: a JSON file to write, with the lens, its angle at the rim and what supports it.
+        accept_doubts: whether to write the calibration although the pictures allow very different
+            lenses.
     """
     # These import OpenCV and Pillow, which other commands of `lens` do not need.
     from darswin.calibrate import estimate as estimate_lens
@@ -55,5 +57,10 @@ def estimate(
         print(f"doubt: {doubt}")
     if report is not None:
         replace_file(report, json.dumps(found.to_dict() | {"pictures": files}, indent=1) + "\n")
+    if out is not None and not (found.is_sure or accept_doubts):
+        raise ValueError(
+            f"{out} is not written, because the pictures allow very different lenses: give more "
+            "pictures, or --accept_doubts true"
+        )
     if out is not None:
         write_lens(found.lens, out, None)

@@ -1,9 +1,9 @@
-"""Fits one lens model to another by least squares on the pixels where rays land."""
+"""Fits a lens model to a lens, or to rays, by least squares on the pixels where rays land."""
 
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,39 +11,58 @@ from torch.autograd import forward_ad
 
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.curves import Tabulated, as_curves, cat
-from darswin.lens.polynomial import PolynomialLens
-from darswin.lens.solve import direction_of
+from darswin.lens.distorted import KannalaBrandt
+from darswin.lens.image import _image_size
+from darswin.lens.polynomial import OCam, OCamInverse, PolynomialLens
+from darswin.lens.solve import direction_of, length_of
+from darswin.utils.arrays import as_tensor
 
 # The grid of rays that are compared.
 RINGS, SPOKES = 200, 16
 ROUNDS = 200
+# Of a field of rays: the rays that are used, at least and about at most; the rounds of weighting;
+# the scale of the Cauchy loss, in median distances; and parts of the picture: what is added to the
+# scale, and the median distance of rays that no lens has.
+FEWEST, ENOUGH, WEIGHTINGS, SCALE, FINE, WILD = 32, 2**13, 10, 2.5, 0.001, 0.1
 
 
 class Fit(NamedTuple):
-    """A fitted lens, and its largest distance from the original lens, (N,) px."""
+    """A fitted lens, and its distance from the original, (N,) px: the largest from a lens, and the
+    median from a field of rays."""
 
     lens: Lens
     error: Tensor
 
 
-def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit:
-    """Finds the lens of another model that is closest to a lens, for all rays up to its θ_max.
+def fit(
+    model: str | type[Lens], lens: Lens | Any, *, terms: int | None = None, weights: Any = None,
+    size: tuple[int, int] | None = None,
+) -> Fit:  # fmt: skip
+    """Finds the lens of a model that is closest to a lens, or to the rays of a picture's pixels.
 
-    Principal point, affine and image size stay the same. Tangential and thin-prism terms are fitted
-    if the model has them; if not, the error includes their effect.
+    To a lens, for all rays up to its θ_max: principal point, affine and image size stay the same.
+    Tangential and thin-prism terms are fitted if the model has them; if not, the error includes
+    their effect.
+
+    To a field of rays, such as a network gives it: the principal point is found too, for square
+    pixels without tangential terms. Outliers count little (Cauchy's loss). θ_max is the largest
+    angle at the pixels whose rays agree with the lens.
 
     Args:
         model: a lens class, or its name in `darswin.lens.MODELS`.
-        lens: N lenses.
+        lens: N lenses; or a field, (h, w, 3), an array or a tensor: the directions of the rays, of
+            any length, with x to the right, y down and z forward; NaN or 0 where unknown.
         terms: the number of polynomial terms. None means the model's default: 2 for `Mei`, 3 for
             `BrownConrady`, 4 for the others.
+        weights: (h, w), how much each ray of a field counts, 0 or more. None means equally.
+        size: (H, W) px of the picture, if the field is a resized one. None means (h, w).
 
     Returns:
-        (lens, error): N lenses in the dtype of `lens`, and the largest distance of each, px, on a
-        grid of rays.
+        (lens, error): N lenses in the dtype of `lens`, and the distance of each, px: the largest on
+        a grid of rays, or the median of a field's rays.
 
     Raises:
-        ValueError: an unknown model, or a model that cannot reach θ_max.
+        ValueError: an unknown model, a model that cannot reach θ_max, or a field with too few rays.
     """
     if isinstance(model, str):
         if model not in MODELS:
@@ -51,6 +70,10 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         model = MODELS[model]
     if not isinstance(model, type) or not issubclass(model, Lens):
         raise TypeError(f"model must be a lens class or its name, got {model!r}")
+    if not isinstance(lens, Lens):
+        return _fit_field(model, lens, terms, weights, size)
+    if weights is not None or size is not None:
+        raise ValueError("weights and size belong to a field of rays, not to a lens")
     if issubclass(model, Tabulated):
         curves = as_curves(lens if lens.is_radial else lens.replace(tangential=None, prism=None))
         return Fit(curves, largest_distance(curves, lens))
@@ -59,6 +82,101 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
     found = cat([fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
     fitted = model(**found | {name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
+
+
+class _Seen(NamedTuple):
+    """Rays, θ (K,) and (cos φ, sin φ), (K, 2), with their pixels (K, 2) and weights (K,)."""
+
+    theta: Tensor
+    direction: Tensor
+    pixels: Tensor
+    weight: Tensor
+
+    def rays(self, lens: Lens) -> tuple[Tensor, Tensor]:
+        """θ (1, K), at most θ_max so that an outlier has a pixel, and directions (1, K, 2)."""
+        return torch.minimum(self.theta, lens.theta_max)[None], self.direction[None]
+
+    def distance(self, lens: Lens) -> Tensor:
+        """(K,) px: from the pixels to those of the lens."""
+        return (lens.pixels(*self.rays(lens))[0] - self.pixels).norm(dim=-1)
+
+    def median(self, values: Tensor) -> Tensor:
+        values, order = values.sort()
+        sums = self.weight[order].cumsum(0)
+        return values[torch.searchsorted(sums, sums[-1:] / 2)]
+
+    def trust(self, distance: Tensor) -> Tensor:
+        """(K,): the part of each weight that the Cauchy loss leaves, for distances (K,) px."""
+        scale = SCALE * self.median(distance) + FINE * self.pixels.amax()
+        return 1 / (1 + (distance / scale).square())
+
+    def curve(self) -> KannalaBrandt:
+        """A flexible lens near the rays: its numbers and its principal point are linear."""
+        weight = self.weight
+        for terms in (*[1] * WEIGHTINGS, *[2] * WEIGHTINGS, *[5] * WEIGHTINGS):
+            powers = self.theta[:, None] ** (2 * torch.arange(terms) + 1)
+            rows = powers[:, None] * self.direction[..., None]
+            rows = torch.cat((rows, torch.eye(2).to(rows).expand(len(rows), 2, 2)), -1)
+            both = weight.sqrt()[:, None, None] * torch.cat((rows, self.pixels[..., None]), -1)
+            *left, right = both.flatten(0, 1).split((terms + 2, 1), 1)
+            found = torch.linalg.lstsq(*left, right).solution[:, 0]
+            weight = self.weight * self.trust((rows @ found - self.pixels).norm(dim=-1))
+        if found[0] > 0:
+            lens = KannalaBrandt(found[0], found[1:-2] / found[0], center=found[-2:])
+            if self.median(self.distance(lens)) < WILD * self.pixels.amax():
+                return lens
+        raise ValueError("no lens has these rays: x must be to the right, y down and z forward")
+
+
+def _fit_field(
+    model: type[Lens], field: Any, terms: int | None, weights: Any, size: tuple[int, int] | None
+) -> Fit:
+    """`fit` to a field of rays."""
+    given = as_tensor(field)
+    rays = given.detach().to("cpu", torch.float64)
+    if rays.dim() != 3 or rays.shape[2] != 3:
+        raise ValueError(f"a field of rays must be (h, w, 3), got {tuple(rays.shape)}")
+    sides = tuple(rays.shape[:2])
+    weight = torch.ones(sides) if weights is None else as_tensor(weights).detach()
+    if tuple(weight.shape) != sides or not bool(((weight >= 0) & weight.isfinite()).all()):
+        raise ValueError(f"weights must be 0 or more and {sides}, got {tuple(weight.shape)}")
+    known = rays.isfinite().all(-1) & rays.any(-1) & (weight.to(rays) > 0)
+    if (count := int(known.sum())) < FEWEST or min(sides) < 2:
+        said = f"{count} known in {sides[0]} × {sides[1]} pixels"
+        raise ValueError(f"a field must have {FEWEST} known rays, in rows and columns, got {said}")
+    picture = rays.new_tensor(sides if size is None else _image_size(size))
+    scale = picture / rays.new_tensor(sides)
+    places = torch.nonzero(known).to(rays)  # (y, x)
+    pixels = ((places + 0.5) * scale - 0.5).flip(1)
+    across, ahead = rays[known].split((2, 1), 1)
+    aside = length_of(across)
+    theta, weight = torch.atan2(aside, ahead[:, 0]), weight.to(rays)[known]
+    seen = _Seen(theta, across / aside[:, None], pixels, weight)
+    some = _Seen(*(part[:: math.ceil(count / ENOUGH)] for part in seen))
+    lens: Lens = some.curve()
+    # The picture may show more than the lens: rays that are far off do not say where it ends.
+    near = seen.pixels[seen.trust(seen.distance(lens)) > 0.1]
+    theta = lens.unproject_pixels(near)[0].nan_to_num(lens.theta_max.item())
+    theta_max = torch.minimum(theta.max(), lens.theta_max)
+    lens = lens.with_theta_max(theta_max)
+    if issubclass(model, Tabulated):
+        lens = as_curves(lens)
+    else:
+        start = fit_one(model, lens, model.terms if terms is None else terms)._tensors()
+        start["center"], start["theta_max"] = lens.center, theta_max
+        # Alone, the rays would give OCamInverse a radius at θ = 0.
+        for _ in range(0 if issubclass(model, OCamInverse) else WEIGHTINGS):
+            lens = model._from_tensors(start)
+            weight = some.weight * some.trust(some.distance(lens))
+            goal = some.pixels[None], weight.sqrt()[None, :, None]
+            del start["theta_max"]
+            lens, _ = _least_squares(model, start, theta_max, *some.rays(lens), *goal, 3)
+            start = lens._tensors()
+        lens = model(**start | {"theta_max": None})
+        lens = lens.with_theta_max(torch.minimum(theta_max, lens.theta_max))
+    dtype = given.dtype if given.dtype == torch.float64 else torch.float32
+    lens = lens.replace(image_size=picture[None])
+    return Fit(lens.to(dtype), seen.median(seen.distance(lens)).to(dtype))
 
 
 def largest_distance(lens: Lens, other: Lens) -> Tensor:
@@ -89,7 +207,7 @@ def fit_one(model: type[Lens], lens: Lens, terms: int, rounds: int = ROUNDS) -> 
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
     found = (
-        _least_squares(model, start, lens.theta_max, theta, direction, goal, rounds)
+        _least_squares(model, start, lens.theta_max, theta, direction, goal, 1.0, rounds)
         for start in _starts(model, lens, terms, aside)
     )
     best, cost = min(found, key=lambda pair: pair[1])
@@ -156,10 +274,11 @@ def _least_squares(
     theta: Tensor,
     direction: Tensor,
     goal: Tensor,
+    weight: Tensor | float,
     rounds: int,
 ) -> tuple[Lens, float]:
     """The closest lens within bounds by the Levenberg–Marquardt method, and its mean squared
-    distance, which is infinite if no lens was found."""
+    distance, times `weight`, which is infinite if no lens was found."""
     packing = Packing(model, start)
     low, high = packing.low, packing.high
 
@@ -168,12 +287,15 @@ def _least_squares(
         return model._from_tensors(packing.tensors(vectors) | limits)
 
     def points(vectors: Tensor) -> Tensor:
-        return lenses_of(vectors)._flat(theta, direction)
+        # A lens without a principal point has it at (0, 0), the middle of one pixel.
+        return weight * lenses_of(vectors).pixels(theta, direction, (1, 1))
+
+    goal, line = weight * goal, theta_max[:, None] * torch.linspace(0, 1, RINGS + 1).to(theta)
+    held = [1] if issubclass(model, OCam) else []  # a kink at the centre
 
     def cost_of(vector: Tensor) -> float:
-        lens = lenses_of(vector[None])
-        rises = bool((lens.project(theta).flatten().diff() > 0).all())
-        value = (lens._flat(theta, direction) - goal).square().mean().item()
+        rises = bool((lenses_of(vector[None]).project(line).flatten().diff() > 0).all())
+        value = (points(vector[None]) - goal).square().mean().item()
         return value if rises and value >= 0 else math.inf
 
     vector = packing.vector(start).clamp(low, high)
@@ -184,6 +306,7 @@ def _least_squares(
     for _ in range(rounds):
         error = (points(vector[None]) - goal).flatten()
         slopes = slopes_of(points, vector).flatten(0, -2)
+        slopes[:, held] = 0
         scale = slopes.norm(dim=0).clamp(min=1e-30)
         before = cost
         while damping < 1e12:

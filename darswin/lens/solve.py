@@ -96,7 +96,7 @@ def _brackets(function: Function, value: Tensor, end: Tensor) -> tuple[Tensor, T
     # With one end for many values, as for the pixels of an image: from a table.
     steps = torch.linspace(0, 1, _TABLE, dtype=end.dtype, device=end.device)
     points = end.reshape(-1, 1) * steps
-    table, rows = function(points), value.expand_as(high).reshape(len(points), -1)
+    table, rows = function(points), value.expand_as(high).reshape(len(points), -1).contiguous()
     after = torch.searchsorted(table, rows).clamp(1, _TABLE - 1)
     (x0, y0), (x1, y1) = ((points.gather(1, k), table.gather(1, k)) for k in (after - 1, after))
     guess = x0 + (x1 - x0) * ((rows - y0) / (y1 - y0)).clamp(0, 1)

@@ -230,6 +230,20 @@ def test_an_interval_has_only_angles_of_lenses(monkeypatch):
     monkeypatch.setattr(lines, "_deviation", lambda fits: 9.0)
     found = from_curves([curves_of(LENSES["equisolid"], 1)], SIZE)
     assert found.interval == (0.0, math.pi) and "very different lenses" in found.doubts[0]
+    assert not found.is_sure
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["Spherical", "KannalaBrandt", "Equidistant"])
+def test_the_spread_is_of_the_whole_curve_and_of_the_model(model):
+    """A model that does not suit the lens is off by no more than three deviations anywhere."""
+    lens, radii = LENSES["stereographic"], torch.linspace(12, 240, 39, dtype=torch.float64)
+    found = from_curves([curves_of(lens, seed) for seed in (1, 2)], SIZE, model)
+    theta, true = (of.with_theta_max(None).unproject(radii[None])[0] for of in (found.lens, lens))
+    off, of_rim = (theta / true - 1).abs(), (found.interval[1] - found.rim) / found.rim
+    assert off.max() < 3 * found.spread and off[-1] < 3 * of_rim <= 3 * found.spread
+    assert found.spread > (0.05 if model == "Equidistant" else 0.004)
+    assert f"known to {found.spread:.1%}" in found.verdict
 
 
 @pytest.mark.slow

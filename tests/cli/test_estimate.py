@@ -53,6 +53,23 @@ def test_a_lens_is_estimated_and_written(rooms, tmp_path, capsys):
     assert content["lens"]["model"] == "Spherical" and content["interval"][0] <= content["rim"]
 
 
+def test_a_lens_that_may_be_another_is_written_only_on_request(
+    rooms, tmp_path, capsys, monkeypatch
+):
+    from darswin.calibrate import Estimate
+
+    monkeypatch.setattr(Estimate, "is_sure", False)
+    out, report = tmp_path / "camera.json", tmp_path / "report.json"
+    command = ["lens", "estimate", str(rooms[0]), "--out", str(out), "--report", str(report)]
+    with pytest.raises(SystemExit) as error:
+        main(command)
+    said = f"{error.value} {capsys.readouterr().err}"
+    assert "camera.json is not written, because the pictures allow very different" in said
+    assert "--accept_doubts" in said and report.exists() and not out.exists()
+    main([*command, "--accept_doubts", "true"])
+    assert len(lenses.load(out)) == 1
+
+
 @pytest.mark.slow
 def test_pictures_turned_by_exif_give_the_lens_of_stored_pictures(rooms, tmp_path):
     from PIL import Image
