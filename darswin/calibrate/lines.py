@@ -165,7 +165,8 @@ def from_curves(
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
     sigmas = np.hypot(0.0 if fov else _deviation(found), misfit(lens, shown, radius))
-    low, high = max(rim - sigmas[-1], 0.0), min(rim + sigmas[-1], math.pi)
+    sigma = float(sigmas[-1])
+    low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     spread = float((sigmas / angles(lens, radius)).max())
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
     oriented = (second >= SECOND[0]).sum()
@@ -178,7 +179,7 @@ def from_curves(
     )
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        "the pictures allow very different lenses: give more of them": sigmas[-1] > UNSURE * rim,
+        "the pictures allow very different lenses: give more of them": sigma > UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
