@@ -2,15 +2,12 @@
 
 from contextlib import suppress
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
 
 from darswin.lens import Lens, fit
-
-if TYPE_CHECKING:
-    from darswin.calibrate.lines import _Seen
 
 RHO = np.linspace(0.05, 1, 20)  # of the radius: where curves are compared
 GROUPS = 8  # of curves; the answers without each of them show the uncertainty
@@ -38,9 +35,10 @@ def misfit(lens: Lens, seen: Lens, radius: float) -> np.ndarray:
     return np.hypot(apart, REAL * found)
 
 
-def deviation(fits: list["_Seen"]) -> np.ndarray:
-    """(20,) rad: the standard deviation of θ, by the jackknife over groups of neighbouring curves,
-    whose errors are alike, and by other beliefs on usual lenses and on the centre."""
+def deviation(fits: list[Any]) -> np.ndarray:
+    """(20,) rad: the standard deviation of θ of the first of some fits to lines. By the jackknife
+    over groups of neighbouring curves, whose errors are alike, and by other beliefs on usual lenses
+    and on the centre."""
     lines, best = fits[0].lines, fits[0]
 
     def curve(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> np.ndarray:
