@@ -228,6 +228,7 @@ class Computations(TorchDispatchMode):
         return result
 
 
+@pytest.mark.unsanitized
 @torch.inference_mode()
 @pytest.mark.parametrize(
     "name",

@@ -25,7 +25,10 @@ from darswin.ops import use_reference
 
 every_case = pytest.mark.parametrize("case", CASES, ids=": ".join)
 small_cases = pytest.mark.parametrize("name", SMALL)
-references = pytest.mark.parametrize("reference", [False, True])
+# The reference is PyTorch alone.
+references = pytest.mark.parametrize(
+    "reference", [False, pytest.param(True, marks=pytest.mark.unsanitized)]
+)
 
 
 # -- values, on every path of the kernels ----------------------------------------------------------
@@ -134,6 +137,7 @@ def test_gradcheck(name, reference):
         )
 
 
+@pytest.mark.unsanitized
 @pytest.mark.parametrize("dtype", [f32, bf16])
 @small_cases
 def test_opcheck(name, dtype):
@@ -224,6 +228,7 @@ def test_export(name):
     assert torch.equal(program.module()(other), made.run(**other))
 
 
+@pytest.mark.unsanitized
 @every_case
 def test_the_reference_in_graphs_for_other_runtimes(case, monkeypatch):
     """They have a fast operator that samples, whose coordinates are rounded between -1 and 1."""
