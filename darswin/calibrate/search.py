@@ -237,7 +237,10 @@ class _Found:
         pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
         place = views.place[pictures].unique(return_inverse=True)[1]
-        parts = [pictures[place % FOLDS == k] for k in range(min(FOLDS, int(place.max()) + 1))]
+        # The order of the pictures does not change the parts.
+        spots = views.corners[pictures].sum((1, 2))
+        rank = spots.new_zeros(int(place.max()) + 1).index_add(0, place, spots).argsort().argsort()
+        parts = [pictures[rank[place] % FOLDS == k] for k in range(min(FOLDS, len(rank)))]
         for part in parts if len(parts) > LEAST_PICTURES else [pictures]:
             rest = pictures[~torch.isin(pictures, part)]
             self.squares[part] = math.nan

@@ -131,7 +131,9 @@ def test_inputs_of_other_kinds_give_the_same(usual):
 @pytest.mark.slow
 def test_neither_order_nor_unit_of_length_matters(usual):
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
-    found, other = of(usual), calibrate(usual.corners[order], 1000 * usual.board, usual.size)
+    found = of(usual, "auto")
+    other = calibrate(usual.corners[order], 1000 * usual.board, usual.size)
+    assert other.models[0][0] == found.models[0][0]
     assert ray_errors(found.lens, other.lens).max() < 1e-3
     assert_close(other.translations, 1000 * found.translations[order], rtol=1e-3, atol=0.1)
 
@@ -216,7 +218,7 @@ def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model):
         said = [text for text in found.doubts if text.startswith("lengths along y are ")]
         assert len(said) == ("affine[3]" in found.parameters) == (words is not None)
         assert not said or re.match(rf"lengths along y are [\d.]+ % {words[4:]} than", said[0])
-    square = of(stretched(true, 1.05), model, square_pixels=True)
+    square = of(stretched(true, 1.02), model, square_pixels=True)
     assert "affine[3]" not in square.parameters and square.left_out > 2 * found.left_out
 
 
