@@ -20,8 +20,7 @@ import torch
 from darswin.calibrate import boards, edges
 from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
-from darswin.calibrate.spread import RHO, USUAL, angles, misfit
-from darswin.calibrate.spread import deviation as _deviation
+from darswin.calibrate.spread import RHO, USUAL, angles, deviation, misfit
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
@@ -38,6 +37,7 @@ LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
+DIFFERENT = "the pictures allow very different lenses: give more of them"
 _cost = attrgetter("cost")
 
 
@@ -68,8 +68,7 @@ class Estimate:
     @property
     def is_sure(self) -> bool:
         """False if the pictures allow very different lenses."""
-        low, high = self.interval
-        return high - low <= 2 * UNSURE * self.rim
+        return DIFFERENT not in self.doubts
 
     def to_dict(self) -> dict[str, Any]:
         """All of it as a JSON object; the lens is described as by `darswin.lens.to_dict`."""
@@ -164,7 +163,7 @@ def from_curves(
     if rim < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigmas = np.hypot(0.0 if fov else _deviation(found), misfit(lens, shown, radius))
+    sigmas = np.hypot(0.0 if fov else deviation(found), misfit(lens, shown, radius))
     sigma = float(sigmas[-1])
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     spread = float((sigmas / angles(lens, radius)).max())
@@ -179,7 +178,7 @@ def from_curves(
     )
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        "the pictures allow very different lenses: give more of them": sigma > UNSURE * rim,
+        DIFFERENT: sigma > UNSURE * rim,
         f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,

@@ -154,6 +154,11 @@ class Views(NamedTuple):
         """Some of the pictures."""
         return Views(self.corners[which], self.seen[which], self.board, self.place[which])
 
+    @property
+    def group(self) -> Tensor:
+        """(P,): `place` as numbers from 0 without gaps."""
+        return self.place.unique(return_inverse=True)[1]
+
     def shaped(self, shape: Tensor) -> Tensor:
         """(K, 3): the points of a board with a shape (3,)."""
         return self.board + (self.by_shape() * shape[:, None, None]).sum(0)

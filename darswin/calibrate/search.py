@@ -209,7 +209,7 @@ class _Found:
 
     def judge(self, views: Views, counts: Tensor) -> None:
         """Computes the covariance and the errors, over the corners that count, (P, K)."""
-        place = views.place[counts.any(1)].unique(return_inverse=True)[1]
+        place = views.of(counts.any(1)).group
         miss, counts, slopes, normal = self._normal(views, counts, self.free)
         self.joint = self.sigma**2 * normal.covariance()
         self.error = miss[counts].square().sum(-1).mean().sqrt().item()
@@ -221,7 +221,7 @@ class _Found:
     def steadiness(self, views: Views, counts: Tensor, top: float) -> Steadiness:
         """Whether the pictures agree, over the corners that count, (P, K), up to an angle, rad."""
         mine, n = views.of(counts.any(1)), len(self.state.vector)
-        place = mine.place.unique(return_inverse=True)[1]
+        place = mine.group
         miss, counts, slopes, normal = self._normal(views, counts, self.free)
         without = miss.new_zeros(int(place.max()) + 1, n)
         if len(without) >= FEW:
@@ -236,7 +236,7 @@ class _Found:
         was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
         pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
-        place = views.place[pictures].unique(return_inverse=True)[1]
+        place = views.of(pictures).group
         # The order of the pictures does not change the parts.
         spots = views.corners[pictures].sum((1, 2))
         rank = spots.new_zeros(int(place.max()) + 1).index_add(0, place, spots).argsort().argsort()

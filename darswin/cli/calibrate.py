@@ -111,8 +111,9 @@ def calibrate(
             progress=lambda step: setattr(progress, "step", step),
         )  # fmt: skip
     lens = _within(seen.brightest, found.lens, theta_max_deg)
-    rest = [text for text in found.doubts if text not in out_of_reach(found.supported, found.lens)]
-    doubts = [*seen.doubts, *rest, *out_of_reach(found.supported, lens)]
+    # Its reach is compared with the image circle, not with the picture's sides.
+    before, after = (out_of_reach(found.supported, one) for one in (found.lens, lens))
+    doubts = [*seen.doubts, *(text for text in found.doubts if text not in before), *after]
     print(_summary(found, seen, doubts))
     try:
         write_lens(lens, out, format, supported=found.supported)

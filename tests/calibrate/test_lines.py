@@ -227,7 +227,7 @@ def test_no_lens_at_all_is_no_answer(monkeypatch):
 
 
 def test_an_interval_has_only_angles_of_lenses(monkeypatch):
-    monkeypatch.setattr(lines, "_deviation", lambda fits: 9.0)
+    monkeypatch.setattr(lines, "deviation", lambda fits: 9.0)
     found = from_curves([curves_of(LENSES["equisolid"], 1)], SIZE)
     assert found.interval == (0.0, math.pi) and "very different lenses" in found.doubts[0]
     assert not found.is_sure
