@@ -101,9 +101,9 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
     where = ["--out", str(quick / "out"), "--results", str(quick)]
     dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK])
     results = json.loads(capsys.readouterr().out.split("cells after", 1)[1].split("\n", 1)[1])
-    before = {(cell["model"], cell["task"]): cell["sets"] for cell in cells.values()}
+    before = {(cell["label"], cell["task"]): cell["sets"] for cell in cells.values()}
     assert len(results) == 2
-    assert all(cell["sets"] == before[cell["model"], cell["task"]] for cell in results)
+    assert all(cell["sets"] == before[cell["label"], cell["task"]] for cell in results)
     # With other options it says so, and mixes nothing.
     with pytest.raises(ValueError, match=r"was made with other settings \(arguments\)"):
         dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK, "--data.flip", "false"])
