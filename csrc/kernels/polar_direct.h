@@ -84,13 +84,13 @@ inline void store_fours(Vector<float, 4> x, Vector<float, 4> y, Vector<float, 4>
   store(to + 8, __builtin_shufflevector(zx, yz, 2, 3, 6, 7));
 }
 
-// The output of a line: sample k goes to to[k * step]. A sample may have fewer than four
-// values. A store of four values may reach beyond it if the next sample of the line follows there,
-// or anywhere if `spare` is true.
+// The output of a line: channel c of sample k goes to to[k * step + c * channel]. A sample may have
+// fewer than four values. If these are neighbours, a store of four values may reach beyond it if
+// the next sample of the line follows there, or anywhere if `spare` is true.
 template <typename T>
 struct LineOutput {
   T* to;
-  int64_t step;
+  int64_t step, channel;
   bool spare;
 };
 
@@ -120,24 +120,28 @@ class DirectImage {
   // Samples the first `count` points of the block by gathers, one after the other. The images are
   // gray or have three planes. The last sixteen points may include some that the step before has
   // already sampled. There is no prefetching, because gathers wait for many pixels at once.
-  void block(int64_t count, T* to) const {
+  void block(int64_t count, const LineOutput<T>& out) const {
     if constexpr (kRegister == 64 && is_same_v<E, float>) {
       const Line all{true, 0, 0, 0, 0, 1, count};
-      if (count < 16) return points(all, 0, count, {to, channels, false});
+      if (count < 16) return points(all, 0, count, out);
       for (int64_t k = 0; k < count; k += 16) {
         k = smaller(k, count - 16);
         const Sixteen<T> sixteen(places, k);
         if (!sixteen.inside()) {
-          points(all, k, k + 16, {to, channels, false});
+          points(all, k, k + 16, out);
           continue;
         }
-        T* out = to + k * channels;
+        T* to = out.to + k * out.step;
         const auto plane = [&](int64_t c) { return sixteen.sample(pixels + c * channel, below); };
         const auto first = plane(0);
         if (channels == 1) {
-          store(out, first);
+          store(to, first);
+        } else if (out.channel == 1) {
+          store_sixteen<T>(first, plane(1), plane(2), to);
         } else {
-          store_sixteen<T>(first, plane(1), plane(2), out);
+          store(to, first);
+          store(to + out.channel, plane(1));
+          store(to + 2 * out.channel, plane(2));
         }
       }
     }
@@ -190,7 +194,8 @@ class DirectImage {
       if ((offset[0] | offset[step] | offset[2 * step] | offset[3 * step]) < 0) {
         points(line, k, k + 4, out);
       } else {
-        four<kChannels, kRow>(first, step, {out.to + k * out.step, out.step, out.spare});
+        four<kChannels, kRow>(first, step,
+                              {out.to + k * out.step, out.step, out.channel, out.spare});
       }
     }
   }
@@ -221,17 +226,24 @@ class DirectImage {
     // No computation is written in two branches. The compiler would move the common part out of
     // both branches. Half of the operations that it fuses elsewhere would then stay unfused.
     if constexpr (kChannels == 3) {
-      store_three<kRow>(plane(0), plane(1), plane(2), out);
+      const V x = plane(0), y = plane(1), z = plane(2);
+      if (out.channel == 1) return store_three<kRow>(x, y, z, out);
+      store_plane<kRow>(x, 0, out);
+      store_plane<kRow>(y, 1, out);
+      store_plane<kRow>(z, 2, out);
       return;
     }
     for (int64_t c = 0; c < (kChannels > 0 ? kChannels : channels); ++c) {
-      const V v = plane(c);
-      if constexpr (kChannels == 1 && kRow) {
-        store(out.to, v);
-      } else {
-        for (int p = 0; p < 4; ++p) out.to[p * out.step + c] = v[p];
-      }
+      store_plane<kRow>(plane(c), c, out);
     }
+  }
+
+  // Stores a channel of four samples.
+  template <bool kRow>
+  static void store_plane(V v, int64_t c, const LineOutput<T>& out) {
+    T* to = out.to + c * out.channel;
+    if (kRow && out.step == 1) return store(to, v);
+    for (int p = 0; p < 4; ++p) to[p * out.step] = v[p];
   }
 
   // Stores four samples of three channels.
@@ -257,7 +269,10 @@ class DirectImage {
       scale[c] = a.pixel_scale[c];
       shift[c] = a.pixel_offset[c];
     }
-    const int64_t whole = kChannels == 4 || out.spare ? line.count : line.flat ? line.count - 1 : 0;
+    int64_t whole = 0;  // the points that store four values
+    if (out.channel == 1) {
+      whole = kChannels == 4 || out.spare ? line.count : line.flat ? line.count - 1 : 0;
+    }
     for (int64_t k = 0; k < line.count; ++k) {
       const int64_t index = line.first + k * line.step;
       if (places.offset[index] < 0) {
@@ -277,7 +292,7 @@ class DirectImage {
       if (k < whole) {
         store(to, v);
       } else {
-        for (int c = 0; c < kChannels; ++c) to[c] = v[c];
+        for (int c = 0; c < kChannels; ++c) to[c * out.channel] = v[c];
       }
     }
   }
@@ -290,7 +305,9 @@ class DirectImage {
       T* to = out.to + k * out.step;
       if (offset < 0) {
         const Corners<T, E> corners(a, b, places.column[index], places.row[index]);
-        for (int64_t c = 0; c < channels; ++c) to[c] = corners.sample(c, right, lower);
+        for (int64_t c = 0; c < channels; ++c) {
+          to[c * out.channel] = corners.sample(c, right, lower);
+        }
         continue;
       }
       const E* pixel = pixels + offset;
@@ -298,8 +315,9 @@ class DirectImage {
         const E* bottom = pixel + below;
         const T sample = bilinear(load<T>(pixel), load<T>(pixel + next), load<T>(bottom),
                                   load<T>(bottom + next), right, lower);
-        to[c] = is_same_v<E, uint8_t> ? normalized(sample, a.pixel_scale[c], a.pixel_offset[c])
-                                      : sample;
+        to[c * out.channel] = is_same_v<E, uint8_t>
+                                  ? normalized(sample, a.pixel_scale[c], a.pixel_offset[c])
+                                  : sample;
       }
     }
   }

@@ -31,10 +31,8 @@ struct Packed {
 
   Packed() = default;
   template <typename T>
-  explicit Packed(const PolarSampleArgs<T>& a, int64_t values = 1)  // of a pixel's channel
-      : pixel(round_up(a.channels, 4) * values),
-        row((a.width + 3) * pixel),
-        size((a.height + 3) * row) {}
+  Packed(const PolarSampleArgs<T>& a, int64_t pixel)
+      : pixel(pixel), row((a.width + 3) * pixel), size((a.height + 3) * row) {}
 };
 
 // The places of a block of points among the pixels. `right` and `lower` are the distances from the

@@ -22,13 +22,17 @@ void interleave(const T* const plane[4], int64_t width, T* to) {
   }
 }
 
-// Packs image b. `planes` has room for 4 rows of the image. Channels beyond those of the image are
-// 0, or 1 for pixels of 8 bits.
+// Packs the channels of image b from `first_channel` on, as many as a packed pixel holds. `planes`
+// has room for 4 rows of the image. Channels beyond those of the image are 0, or 1 for pixels of 8
+// bits.
 template <typename T, typename E>
-void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* planes, T* to) {
+void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t first_channel,
+          T* planes, T* to) {
   constexpr T kBeyond = is_same_v<E, uint8_t>;
-  const E* image = static_cast<const E*>(a.image) + b * a.image_stride[0];
+  const int64_t channels = smaller(a.channels - first_channel, packed.pixel);
   const int64_t channel_stride = a.image_stride[1], column_stride = a.image_stride[3];
+  const E* image =
+      static_cast<const E*>(a.image) + b * a.image_stride[0] + first_channel * channel_stride;
   const bool pixelwise = column_stride != 1 && packed.pixel == 4;
   for (int64_t y = 0; y < a.height; ++y) {
     const E* from = image + y * a.image_stride[2];
@@ -38,17 +42,17 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
     for (int64_t x = 0; x < a.width && pixelwise; ++x) {
       const E* pixel = from + x * column_stride;
       for (int64_t c = 0; c < 4; ++c) {
-        row[4 * x + c] = c < a.channels ? load<T>(pixel + c * channel_stride) : kBeyond;
+        row[4 * x + c] = c < channels ? load<T>(pixel + c * channel_stride) : kBeyond;
       }
     }
-    for (int64_t first = 0; first < a.channels && !pixelwise; first += 4) {
+    for (int64_t first = 0; first < channels && !pixelwise; first += 4) {
       // Four channels as planes. A plane points into the image if it can be read as it is, and to a
       // converted copy otherwise.
       const T* plane[4];
       for (int64_t c = 0; c < 4; ++c) {
         T* copy = planes + c * a.width;
         plane[c] = copy;
-        if (first + c >= a.channels) {
+        if (first + c >= channels) {
           for (int64_t x = 0; x < a.width; ++x) copy[x] = kBeyond;
           continue;
         }
@@ -89,9 +93,9 @@ inline void interpolate(const T* pixel, const T* below, T right, T lower, Write 
   }
 }
 
-// Interpolates two points in a register of 256 bits. One load takes a pixel and its right
-// neighbour.
-template <typename T>
+// Interpolates the points 0 and `step` in a register of 256 bits. One load takes a pixel and its
+// right neighbour.
+template <int step, typename T>
 inline Vector<T, 8> interpolate_two(const T* pixels, const T* below, const int32_t* offset,
                                     const T* right, const T* lower) {
   using V = Vector<T, 8>;
@@ -99,33 +103,39 @@ inline Vector<T, 8> interpolate_two(const T* pixels, const T* below, const int32
     const V down = splat<V>(lower[k]);
     return between(load<V>(pixels + offset[k]), load<V>(below + offset[k]), 1 - down, down);
   };
-  const V first = pair(0), second = pair(1);
-  const auto both = (V)splat<Vector<double, 4>>(load_bits<double>(right));
-  const V along = __builtin_shufflevector(both, both, 0, 0, 0, 0, 5, 5, 5, 5);
+  const V first = pair(0), second = pair(step);
+  const V along = __builtin_shufflevector(splat<V>(right[0]), splat<V>(right[step]), 0, 1, 2, 3, 12,
+                                          13, 14, 15);
   return between(even_quads(first, second), odd_quads(first, second), 1 - along, along);
 }
 
-// Interpolates four points in a register of 512 bits. It first takes two pairs of pixels and the
-// two pairs below them, then four pixels and their right neighbours. Loads and stores limit the
-// speed of a single point. Here one load brings the weights of four points, and one store writes
-// points that follow each other. The function is a template, because only tiers with such registers
-// have two_eights and pick.
-template <typename T>
+// Interpolates the points first, first + step, first + 2 * step and first + 3 * step in a register
+// of 512 bits. It first takes two pairs of pixels and the two pairs below them, then four pixels
+// and their right neighbours. Loads and stores limit the speed of a single point. Here one load
+// brings the weights of four points or of all sixteen. The function is a template, because only
+// tiers with such registers have two_eights, pick and permuted.
+template <int step, typename T>
 inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int32_t* offset,
-                                      const T* right, const T* lower) {
+                                      const T* right, const T* lower, int first) {
   using V = Vector<T, 16>;
   using Index = Vector<int32_t, 16>;
-  constexpr Index first_two = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
+  constexpr Index two = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
   constexpr Index all = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-  const auto down = load<Vector<T, 4>>(lower), along = load<Vector<T, 4>>(right);
-  const V top = two_eights(pixels + offset[0], pixels + offset[1]);
-  const V bottom = two_eights(below + offset[0], below + offset[1]);
-  const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
-  const V bottom2 = two_eights(below + offset[2], below + offset[3]);
-  const auto mix = [](V a, V b, V t) { return between(a, b, 1 - t, t); };
-  const V pairs = mix(top, bottom, pick(down, first_two));
-  const V pairs2 = mix(top2, bottom2, pick(down, first_two + 2));
-  return mix(even_quads(pairs, pairs2), odd_quads(pairs, pairs2), pick(along, all));
+  const auto weights = [&](const T* of, Index point) {
+    if constexpr (step == 1) {
+      return pick(load<Vector<T, 4>>(of + first), point);
+    } else {
+      return permuted(load<V>(of), step * point + first);
+    }
+  };
+  const auto pairs = [&](int point) {
+    const int32_t at = offset[first + point * step], next = offset[first + (point + 1) * step];
+    const V down = weights(lower, two + point);
+    return between(two_eights(pixels + at, pixels + next), two_eights(below + at, below + next),
+                   1 - down, down);
+  };
+  const V front = pairs(0), back = pairs(2), along = weights(right, all);
+  return between(even_quads(front, back), odd_quads(front, back), 1 - along, along);
 }
 
 // How samples are normalized: not at all, or as those of 8-bit pixels inside the image, or as those
@@ -175,7 +185,7 @@ template <Normalization how, typename T>
     const auto scales = repeat(scale), shifts = repeat(shift);
     for (; k + 4 <= count; k += 4) {
       const auto v = finished<how>(
-          interpolate_four(pixels, below, offset + k, right + k, lower + k), scales, shifts);
+          interpolate_four<1>(pixels, below, offset + k, right + k, lower + k, 0), scales, shifts);
       if (room[k] >= 4 * channels) {
         store_quarters(to + target[k], v, channels);
       } else {
@@ -192,8 +202,8 @@ template <Normalization how, typename T>
   if constexpr (is_same_v<T, float> && kRegister == 32) {
     const auto scales = repeat(scale), shifts = repeat(shift);
     for (; k + 2 <= last_row; k += 2) {
-      const auto v = finished<how>(interpolate_two(pixels, below, offset + k, right + k, lower + k),
-                                   scales, shifts);
+      const auto v = finished<how>(
+          interpolate_two<1>(pixels, below, offset + k, right + k, lower + k), scales, shifts);
       store(to + target[k], lower_half(v));
       store(to + target[k + 1], upper_half(v));
     }
@@ -213,6 +223,55 @@ template <Normalization how, typename T>
     for (int c = 0; c < 4; ++c) {
       if (c < channels) to[target[k] + c] = v[c];
     }
+  }
+}
+
+// Samples `count` points of up to four channels of a packed image. Channel c of point k goes to
+// to[c * plane + k].
+template <Normalization how, typename T>
+[[gnu::noinline]] void sample_planes(const PolarSampleArgs<T>& a, const T* pixels, int64_t row,
+                                     const PackedPlaces<T>& places, int64_t first, int64_t count,
+                                     int64_t channels, int64_t plane, T* to) {
+  const T* below = pixels + row;
+  const int32_t* offset = places.offset + first;
+  const T *right = places.right + first, *lower = places.lower + first;
+  using V = Vector<T, 4>;
+  constexpr bool bytes = how != Normalization::none;
+  const V scale = bytes ? load<V>(a.pixel_scale) : V{};
+  const V shift = bytes ? load<V>(a.pixel_offset) : V{};
+  int64_t k = 0;
+  if constexpr (is_same_v<T, float> && kRegister >= 32) {
+    // v[p] has points p, p + 4, ... of a register of planes, so that the transposition of each 128
+    // bits puts all points in their order. The last register may include points that the step
+    // before has already sampled.
+    constexpr int kL = kLanes<float>;
+    const auto scales = repeat(scale), shifts = repeat(shift);
+    for (; count >= kL && k < count; k += kL) {
+      k = smaller(k, count - kL);
+      Floats v[4];
+#pragma GCC unroll 4
+      for (int p = 0; p < 4; ++p) {
+        if constexpr (kRegister == 64) {
+          v[p] = interpolate_four<4>(pixels, below, offset + k, right + k, lower + k, p);
+        } else {
+          v[p] = interpolate_two<4>(pixels, below, offset + k + p, right + k + p, lower + k + p);
+        }
+        v[p] = finished<how>(v[p], scales, shifts);
+      }
+      transpose_quads(v);
+#pragma GCC unroll 4
+      for (int c = 0; c < 4; ++c) {
+        if (c < channels) store(to + c * plane + k, v[c]);
+      }
+    }
+  }
+  for (; k < count; ++k) {
+    interpolate(pixels + offset[k], below + offset[k], right[k], lower[k], [&](int e, auto v) {
+      if constexpr (bytes) v = finished<how>(v, scale, shift);
+      for (int c = 0; c < kCount<decltype(v)>; ++c) {
+        if (e + c < channels) to[(e + c) * plane + k] = v[c];
+      }
+    });
   }
 }
 

@@ -7,22 +7,26 @@
 namespace darswin {
 namespace {
 
-// The layout of a row. Channel c of point (sector, s) is at first + sector * sector_stride + s *
-// sample_stride + c * channel_stride.
-struct Row {
-  int64_t first, sector_stride, sample_stride, channel_stride;
+// The steps in memory from a sample to that of the next radius, sector, azimuth and channel.
+struct Strides {
+  int64_t row, sector, sample, channel;
 };
 
 template <typename T>
-Row output_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
-  if (!a.tokens) {
-    const int64_t plane = a.num_radii * a.num_azimuths;
-    return {b * a.channels * plane + i * a.num_azimuths, a.samples_a, 1, plane};
-  }
-  const int64_t rings = a.num_radii / a.samples_r, sectors = a.num_azimuths / a.samples_a;
-  const int64_t piece = a.samples_a * a.channels, token = a.samples_r * piece;
-  const int64_t ring = b * rings + i / a.samples_r;
-  return {ring * sectors * token + i % a.samples_r * piece, token, a.channels, 1};
+Strides output_strides(const PolarSampleArgs<T>& a) {
+  const int64_t piece = a.samples_a * a.channels;
+  if (a.tokens) return {piece, a.samples_r * piece, a.channels, 1};
+  return {a.num_azimuths, a.samples_a, 1, a.num_radii * a.num_azimuths};
+}
+
+// Returns the index of the first sample of radius i of image b in the output.
+template <typename T>
+int64_t output_start(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
+  const Strides strides = output_strides(a);
+  const int64_t image = b * a.num_radii * a.num_azimuths * a.channels;
+  if (!a.tokens) return image + i * strides.row;
+  const int64_t ring = a.samples_r * a.num_azimuths * a.channels;
+  return image + i / a.samples_r * ring + i % a.samples_r * strides.row;
 }
 
 // Returns the bytes of one row, with pixels padded to four channels.
@@ -40,48 +44,38 @@ void with_output_type(const PolarSampleArgs<T>& a, Use use) {
   use.template operator()<T>();
 }
 
-// Writes (num_azimuths, C) samples to a row of the output.
+// Writes the samples of a radius to the output: (num_azimuths, C) for tokens, else (C,
+// num_azimuths).
 template <typename T>
-void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples) {
+void write_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, const T* samples) {
   with_output_type(a, [&]<typename E>() {
-    E* out = static_cast<E*>(a.out) + row.first;
-    const int64_t piece = a.samples_a * a.channels;
-    if (a.tokens) {
-      for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector) {
-        copy(samples + sector * piece, piece, out + sector * row.sector_stride);
-      }
-      return;
-    }
-    for (int64_t c = 0; c < a.channels; ++c) {
-      E* to = out + c * row.channel_stride;
-      const T* from = samples + c;
-      if (a.channels == 3) {  // a constant stride becomes shuffles
-#pragma omp simd
-        for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * 3]);
-      } else {
-        for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * a.channels]);
-      }
+    const Strides strides = output_strides(a);
+    E* out = static_cast<E*>(a.out) + output_start(a, b, i);
+    const int64_t piece = a.tokens ? strides.row : a.num_azimuths;
+    const int64_t step = a.tokens ? strides.sector : strides.channel;
+    for (int64_t values = a.num_azimuths * a.channels; values > 0; values -= piece) {
+      copy(samples, piece, out);
+      samples += piece, out += step;
     }
   });
 }
 
-// Reads a row of gradients as (num_azimuths, C).
+// Reads the gradients of a radius as (num_azimuths, C).
 template <typename T>
-void read_row(const PolarSampleArgs<T>& a, const Row& row, T* to) {
+void read_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, T* to) {
   with_output_type(a, [&]<typename E>() {
-    const E* from = static_cast<const E*>(a.grad_out) + row.first;
-    const int64_t piece = a.samples_a * a.channels;
-    for (int64_t j = 0; j < a.num_azimuths; j += a.samples_a, from += row.sector_stride) {
-      T* sector = to + j * a.channels;
-      if (row.channel_stride == 1) {
-        copy(from, piece, sector);
-        continue;
+    const Strides strides = output_strides(a);
+    const E* from = static_cast<const E*>(a.grad_out) + output_start(a, b, i);
+    if (a.tokens) {
+      for (int64_t j = 0; j < a.num_azimuths; j += a.samples_a) {
+        copy(from, strides.row, to);
+        from += strides.sector, to += strides.row;
       }
-      for (int64_t s = 0; s < a.samples_a; ++s) {
-        for (int64_t c = 0; c < a.channels; ++c) {
-          sector[s * a.channels + c] =
-              load<T>(from + s * row.sample_stride + c * row.channel_stride);
-        }
+      return;
+    }
+    for (int64_t j = 0; j < a.num_azimuths; ++j) {
+      for (int64_t c = 0; c < a.channels; ++c) {
+        to[j * a.channels + c] = load<T>(from + j + c * strides.channel);
       }
     }
   });

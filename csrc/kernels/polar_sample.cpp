@@ -23,18 +23,21 @@ void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scrat
   T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + Sampler<T>::bytes(a));
   const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
   const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, with three spare
-  const bool to_output = a.tokens && !a.narrow;
-  Sampler<T> sampler(a, to_output ? a.samples_r * piece : piece, to_output ? piece : values,
-                     scratch);
+  Strides strides = output_strides(a);
+  if (a.narrow) {  // float samples are converted row by row
+    strides.row = values;
+    (a.tokens ? strides.sector : strides.channel) = a.tokens ? piece : a.num_azimuths;
+  }
+  Sampler<T> sampler(a, strides, scratch);
   for (int64_t item = begin; item < end; ++item) {
-    const int64_t b = item / rings, ring = item % rings;
-    if (to_output) {
-      sampler.ring(b, ring, static_cast<T*>(a.out) + output_row(a, b, ring * a.samples_r).first);
+    const int64_t b = item / rings, ring = item % rings, first = ring * a.samples_r;
+    if (!a.narrow) {
+      sampler.ring(b, ring, static_cast<T*>(a.out) + output_start(a, b, first));
       continue;
     }
     sampler.ring(b, ring, samples);
     for (int64_t n = 0; n < a.samples_r; ++n) {
-      write_row(a, output_row(a, b, ring * a.samples_r + n), samples + n * values);
+      write_row(a, b, first + n, samples + n * values);
     }
   }
 }
@@ -84,7 +87,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     T* grad_offsets = a.grad_offsets == nullptr
                           ? nullptr
                           : a.grad_offsets + b * a.offsets_stride + i * a.num_azimuths;
-    read_row(a, output_row(a, b, i), grads);
+    read_row(a, b, i, grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {

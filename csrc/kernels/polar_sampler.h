@@ -3,6 +3,7 @@
 
 #include "polar_bytes.h"
 #include "polar_packed.h"
+#include "polar_rows.h"
 
 namespace darswin {
 namespace {
@@ -11,19 +12,19 @@ template <typename T>
 class Sampler {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
-    const int64_t values = a.packed ? Packed(a).size + 16 + 4 * a.width : 0;
+    const int64_t values = a.packed ? packed_values(a) + 16 + 4 * a.width : 0;
     return round_up(sizeof(State), 64) + round_up(values * sizeof(T), 64);
   }
 
-  // Channel c of sample (row, s) of a sector's token goes to to[sector * sector_stride + row *
-  // row_stride + s * C + c]. There are two layouts. Either each token is contiguous, or each row
-  // (one radius of all tokens) is contiguous and has room for three values behind it.
-  Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
+  // `strides` are those of the memory that ring() fills. There are three layouts. The channels may
+  // be planes. Or each token is contiguous, or each row (one radius of all tokens) is contiguous
+  // and has room for three values behind it.
+  Sampler(const PolarSampleArgs<T>& args, const Strides& strides, void* scratch)
       : a(args),
-        packed(args.packed ? Packed(args) : Packed()),
-        sector_stride(sector_stride),
-        row_stride(row_stride),
-        in_line(args.packed && args.channels <= 4 && args.samples_a * args.channels >= 4 &&
+        packed(packed_layout(args)),
+        strides(strides),
+        in_line(args.packed && args.tokens && args.channels <= 4 &&
+                args.samples_a * args.channels >= 4 &&
                 (args.samples_a <= kBlock || args.samples_r == 1) && reach_of_block() < INT32_MAX),
         state(*static_cast<State*>(scratch)),
         points(state.points),
@@ -33,7 +34,7 @@ class Sampler {
     for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
       for (int64_t sector = 0; sector * a.samples_a < columns; ++sector) {
         for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
-          const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
+          const int64_t to = row * strides.row + sector * strides.sector + s * a.channels;
           state.targets.target[k] = static_cast<int32_t>(to);
           const int64_t room = smaller((a.samples_a - s) * a.channels, kRoom);
           state.targets.room[k] = static_cast<int32_t>(room);
@@ -46,7 +47,10 @@ class Sampler {
   void ring(int64_t b, int64_t ring, T* to) {
     if (a.packed && b != image_in_hand) {
       with_pixel_type<T>(a.pixel, [&]<typename E>() {
-        pack<T, E>(a, packed, b, image + packed.size + 16, image);
+        T* to = image;
+        for (int64_t c = 0; c < a.channels; c += packed.pixel, to += packed.size) {
+          pack<T, E>(a, packed, b, c, image + packed_values(a) + 16, to);
+        }
       });
       image_in_hand = b;
     }
@@ -74,6 +78,16 @@ class Sampler {
     T samples[4 * kBlock];
   };
 
+  // A packed image has all channels of a pixel. If the samples are planes, it has four channels,
+  // and further images with the next four follow.
+  static Packed packed_layout(const PolarSampleArgs<T>& a) {
+    return a.packed ? Packed(a, a.tokens ? round_up(a.channels, 4) : 4) : Packed();
+  }
+  static int64_t packed_values(const PolarSampleArgs<T>& a) {
+    const Packed packed = packed_layout(a);
+    return units(a.channels, packed.pixel) * packed.size;
+  }
+
   // Returns whether polar_bytes.h samples the image.
   static bool reads_bytes(const PolarSampleArgs<T>& a) {
     const double last =
@@ -85,8 +99,8 @@ class Sampler {
 
   // Returns a bound of the distance from the block's first point in the output to any other.
   int64_t reach_of_block() const {
-    return smaller(kBlock, a.samples_r) * row_stride +
-           block_columns() / a.samples_a * sector_stride;
+    return smaller(kBlock, a.samples_r) * strides.row +
+           block_columns() / a.samples_a * strides.sector;
   }
 
   // Returns the number of columns of a block. A block is a few whole tokens, so that their pixels
@@ -104,7 +118,8 @@ class Sampler {
   // Samples points j to j + count of `rows` radii of a ring, starting at its radius `row`.
   void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
     const int64_t first = ring * a.samples_r + row;
-    T* out = to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
+    T* out = to + j / a.samples_a * strides.sector + j % a.samples_a * strides.sample +
+             row * strides.row;
     if (!a.packed) {
       for (int64_t n = 0; n < rows; ++n) {
         points.template find_direct<false>(a, a.image_stride + 2, b, first + n, j, count,
@@ -119,14 +134,15 @@ class Sampler {
     }
     for (int64_t n = 0; n < rows; ++n) {
       points.find_packed(a, packed, b, first + n, j, count, n * count);
-      if (row_stride == a.samples_a * a.channels && rows == a.samples_r) {
+      if (a.tokens && strides.row == a.samples_a * a.channels && rows == a.samples_r) {
         // The tokens of the next block follow these in memory, so this prefetches their memory.
         const char* next =
-            reinterpret_cast<const char*>(to + (j + count) / a.samples_a * sector_stride);
-        const int64_t bytes = count * row_stride / a.samples_a * sizeof(T);
+            reinterpret_cast<const char*>(to + (j + count) / a.samples_a * strides.sector);
+        const int64_t bytes = count * strides.row / a.samples_a * sizeof(T);
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
+    if (!a.tokens) return planes(rows, count, out);
     // The targets are computed for a whole block. They suit a smaller block only if all its points
     // have the same radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
@@ -134,26 +150,44 @@ class Sampler {
       // memory is written later, except behind the last three points of the block.
       const bool last = row + rows == a.samples_r && a.samples_r > 1;
       const int64_t all = rows * count, last_row = last ? all - count : all - 3;
-      const auto sample = [&]<Normalization how>() {
+      return with_normalization([&]<Normalization how>() {
         sample_points<how>(a, image, packed.row, points.packed, last_row, all, state.targets, out);
-      };
-      using enum Normalization;
-      if (a.pixel != Pixel::u8) return sample.template operator()<none>();
-      if constexpr (is_same_v<T, float>) {
-        return ring_inside ? sample.template operator()<inside>()
-                           : sample.template operator()<border>();
-      }
+      });
     }
     for (int64_t n = 0; n < rows; ++n) {
-      packed_row(j, count, n * count, to + (row + n) * row_stride);
+      packed_row(j, count, n * count, to + (row + n) * strides.row);
     }
+  }
+
+  template <typename Sample>
+  void with_normalization(Sample sample) const {
+    using enum Normalization;
+    if (a.pixel != Pixel::u8) return sample.template operator()<none>();
+    if constexpr (is_same_v<T, float>) {
+      return ring_inside ? sample.template operator()<inside>()
+                         : sample.template operator()<border>();
+    }
+  }
+
+  // Samples the planes of a block, `rows` times `count` points of a packed image.
+  void planes(int64_t rows, int64_t count, T* to) const {
+    with_normalization([&]<Normalization how>() {
+      const T* pixels = image;
+      for (int64_t c = 0; c < a.channels; c += packed.pixel, pixels += packed.size) {
+        for (int64_t n = 0; n < rows; ++n) {
+          sample_planes<how>(a, pixels, packed.row, points.packed, n * count, count,
+                             smaller(a.channels - c, 4), strides.channel,
+                             to + n * strides.row + c * strides.channel);
+        }
+      }
+    });
   }
 
   // Samples points j to j + count of a radius, with any number of channels. Their places begin at
   // index `first`.
   void packed_row(int64_t j, int64_t count, int64_t first, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
-      T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;
+      T* to = row + (j + k) / a.samples_a * strides.sector + (j + k) % a.samples_a * a.channels;
       const T* pixel = image + points.packed.offset[first + k];
       const T right = points.packed.right[first + k], lower = points.packed.lower[first + k];
       const T *below = pixel + packed.row, *next = pixel + packed.pixel,
@@ -173,6 +207,10 @@ class Sampler {
     }
   }
 
+  // The step between the channels of a sample in `state.samples`, and between its points.
+  int64_t channel_step() const { return a.tokens ? 1 : kBlock; }
+  int64_t point_step() const { return a.tokens ? a.channels : 1; }
+
   // Samples the first `count` points of a block of bytes, one after the other.
   void sample_bytes(int64_t b, int64_t count) const {
     if constexpr (is_same_v<T, float>) {
@@ -189,18 +227,25 @@ class Sampler {
       const DirectPlaces<T>& at = points.direct;
       for (int64_t k = 0; k < count; k += kByteBlock) {
         const int64_t part = smaller(kByteBlock, count - k);
-        T* to = state.samples + k * a.channels;
+        T* to = state.samples + k * point_step();
         if (a.height > 1 && a.width > 1) {
           for (int64_t e = 0; e < part; ++e) {
             const int64_t offset = at.offset[k + e];
             state.bytes.offset[e] = offset < 0 ? 0 : static_cast<int32_t>(offset);
           }
           state.bytes.sample(bytes, at.right + k, at.lower + k, part);
-          state.bytes.write(a.channels, part, to);
+          if (a.tokens) {
+            state.bytes.write(a.channels, part, to);
+          } else {
+            for (int64_t c = 0; c < a.channels; ++c) {
+              copy(state.bytes.samples[c], part, to + c * kBlock);
+            }
+          }
         }
-        for (int64_t e = k; e < k + part; ++e, to += a.channels) {
+        for (int64_t e = k; e < k + part; ++e, to += point_step()) {
           for (int64_t c = 0; c < a.channels && at.offset[e] < 0; ++c) {
-            to[c] = border_sample(bytes, at.column[e], at.row[e], at.right[e], at.lower[e], c);
+            to[c * channel_step()] =
+                border_sample(bytes, at.column[e], at.row[e], at.right[e], at.lower[e], c);
           }
         }
       }
@@ -209,11 +254,20 @@ class Sampler {
 
   // Copies the samples of a block, `rows` times `count` points, to the output.
   void spread(int64_t rows, int64_t count, T* to) const {
+    if (!a.tokens) {
+      for (int64_t c = 0; c < a.channels; ++c) {
+        const T* from = state.samples + c * kBlock;
+        for (int64_t row = 0; row < rows; ++row, from += count) {
+          copy(from, count, to + c * strides.channel + row * strides.row);
+        }
+      }
+      return;
+    }
     const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
     const T* from = state.samples;
     for (int64_t row = 0; row < rows; ++row) {
-      T* out = to + row * row_stride;
-      for (int64_t k = 0; k < count; k += part, from += piece, out += sector_stride) {
+      T* out = to + row * strides.row;
+      for (int64_t k = 0; k < count; k += part, from += piece, out += strides.sector) {
         copy(from, piece, out);
       }
     }
@@ -227,26 +281,25 @@ class Sampler {
                                       T* to) const {
     const DirectImage<T, E> pixels(a, b, points.direct);
     if (a.gathers) {
-      pixels.block(rows * count, state.samples);
+      pixels.block(rows * count, {state.samples, point_step(), channel_step(), false});
       return spread(rows, count, to);
     }
-    const bool joined = rows == 1 && sector_stride == a.samples_a * a.channels;
+    const bool joined = rows == 1 && strides.sector == a.samples_a * strides.sample;
     const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, pixels.planes() > 1);
     const auto fetch = [&](const Line& line) { pixels.fetch(line); };
     const int64_t width = smaller(a.samples_a, count);
     visit_lines(lines, fetch, [&](const Line& line) {
-      T* out = to + line.token * sector_stride + line.sample * a.channels + line.row * row_stride;
-      if (line.flat) {
-        pixels.sample(line, {out, a.channels, false});
-      } else {
-        pixels.sample(line, {out, row_stride, line.sample + 1 < width});
-      }
+      T* out =
+          to + line.token * strides.sector + line.sample * strides.sample + line.row * strides.row;
+      const int64_t step = line.flat ? strides.sample : strides.row;
+      const bool spare = a.tokens && !line.flat && line.sample + 1 < width;
+      pixels.sample(line, {out, step, strides.channel, spare});
     });
   }
 
   const PolarSampleArgs<T>& a;
   const Packed packed;
-  const int64_t sector_stride, row_stride;
+  const Strides strides;
   const bool in_line;
   State& state;
   PlacedPoints<T>& points;

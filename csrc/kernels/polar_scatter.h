@@ -53,7 +53,7 @@ class Scatter {
   // Adds the gradients of a ring.
   void ring(int64_t ring) {
     const int64_t first = ring * a.samples_r;
-    const auto read = [&](int64_t n, T* to) { read_row(a, output_row(a, image, first + n), to); };
+    const auto read = [&](int64_t n, T* to) { read_row(a, image, first + n, to); };
     if (keep == kDirect) {
       bool any = false;
       for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
@@ -102,12 +102,13 @@ class Scatter {
   static Keeping keeping(const PolarSampleArgs<T>& a) {
     if (!a.packed && a.pixel != Pixel::bf16) return kDirect;
     const bool cells =
-        sizeof(T) == sizeof(float) && a.channels <= 4 && Packed(a).size * 16 <= kCellBytes;
+        sizeof(T) == sizeof(float) && a.channels <= 4 && Packed(a, 4).size * 16 <= kCellBytes;
     return cells ? kCells : kPacked;
   }
 
   static Packed sums_layout(const PolarSampleArgs<T>& a) {
-    return keeping(a) == kDirect ? Packed() : Packed(a, keeping(a) == kCells ? 4 : 1);
+    if (keeping(a) == kDirect) return Packed();
+    return Packed(a, keeping(a) == kCells ? 16 : round_up(a.channels, 4));
   }
 
   // The band keeps the sums of its rows of pixels. The outermost bands also keep the border. Cells

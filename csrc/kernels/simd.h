@@ -87,23 +87,26 @@ inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
   for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
 }
 
-// Writes the transpose of a square of kLanes x kLanes. The rows of `to` are `stride` apart. The
-// first part transposes each 4 x 4 square within 128 bits. The second part transposes the blocks of
-// 128 bits among themselves.
-inline void transpose_square(Floats* rows, float* to, int64_t stride) {
-  constexpr int kL = kLanes<float>, kQuads = kL / 4;
-  // The even and odd parts, within each 128 bits.
+// Transposes the 4 x 4 square within each 128 bits of four registers.
+inline void transpose_quads(Floats* rows) {
+  constexpr int kL = kLanes<float>;
   const auto even = [](Floats a, Floats b) {
     return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL; }>(a, b);
   };
   const auto odd = [](Floats a, Floats b) {
     return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL + 1; }>(a, b);
   };
+  split_pairs<4>(rows, 1, even, odd);
+  split_pairs<4>(rows, 1, even, odd);
+}
+
+// Writes the transpose of a square of kLanes x kLanes. The rows of `to` are `stride` apart. The
+// first part transposes each 4 x 4 square within 128 bits. The second part transposes the blocks of
+// 128 bits among themselves.
+inline void transpose_square(Floats* rows, float* to, int64_t stride) {
+  constexpr int kL = kLanes<float>, kQuads = kL / 4;
 #pragma GCC unroll 4
-  for (int quad = 0; quad < kQuads; ++quad) {
-    split_pairs<4>(rows + 4 * quad, 1, even, odd);
-    split_pairs<4>(rows + 4 * quad, 1, even, odd);
-  }
+  for (int quad = 0; quad < kQuads; ++quad) transpose_quads(rows + 4 * quad);
 #pragma GCC unroll 4
   for (int lane = 0; lane < 4; ++lane) {
     for (int step = 1; step < kQuads; step *= 2) {
