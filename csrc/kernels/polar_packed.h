@@ -3,24 +3,10 @@
 // Interpolation goes first downwards, then to the right, four channels at a time.
 #pragma once
 
-#include "polar_image.h"
+#include "polar_rows.h"
 
 namespace darswin {
 namespace {
-
-// Interleaves four planes: (4, width) -> (width, 4).
-template <typename T>
-void interleave(const T* const plane[4], int64_t width, T* to) {
-  using V = Vector<T, 4>;
-  int64_t x = 0;
-  for (; x + 4 <= width; x += 4) {
-    transpose4(load<V>(plane[0] + x), load<V>(plane[1] + x), load<V>(plane[2] + x),
-               load<V>(plane[3] + x), to + 4 * x, 4);
-  }
-  for (; x < width; ++x) {
-    for (int c = 0; c < 4; ++c) to[4 * x + c] = plane[c][x];
-  }
-}
 
 // Packs the channels of image b from `first_channel` on, as many as a packed pixel holds. `planes`
 // has room for 4 rows of the image. Channels beyond those of the image are 0, or 1 for pixels of 8
@@ -66,7 +52,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t 
         for (int64_t x = 0; x < a.width; ++x) copy[x] = load<T>(source + x * column_stride);
       }
       if (packed.pixel == 4) {
-        interleave(plane, a.width, row);
+        interleave(plane, a.width, row, 4);
       } else {
         for (int64_t x = 0; x < a.width; ++x) {
           for (int64_t c = 0; c < 4; ++c) row[x * packed.pixel + first + c] = plane[c][x];

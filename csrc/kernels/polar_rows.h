@@ -35,6 +35,27 @@ int64_t row_bytes(const PolarSampleArgs<T>& a) {
   return round_up((a.num_azimuths * round_up(a.channels, 4) + 16) * sizeof(T), 64);
 }
 
+// Interleaves four planes: channel c of point k goes to to[k * step + c].
+template <typename T, typename E>
+void interleave(const E* const plane[4], int64_t count, T* to, int64_t step) {
+  int64_t k = 0;
+  if constexpr (is_same_v<T, float> && kRegister >= 32) {
+    constexpr int kL = kLanes<float>;
+    for (; step == 4 && k + kL <= count; k += kL) {
+      const auto read = [&](int c) { return load<Floats>(plane[c] + k); };
+      interleave_four(read(0), read(1), read(2), read(3), to + 4 * k);
+    }
+  }
+  using V = Vector<T, 4>;
+  for (; k + 4 <= count; k += 4) {
+    const auto read = [&](int c) { return load<V>(plane[c] + k); };
+    transpose4(read(0), read(1), read(2), read(3), to + k * step, step);
+  }
+  for (; k < count; ++k) {
+    for (int c = 0; c < 4; ++c) to[k * step + c] = load<T>(plane[c] + k);
+  }
+}
+
 // Calls use<E>(), where E is the type of the output or of its gradient.
 template <typename T, typename Use>
 void with_output_type(const PolarSampleArgs<T>& a, Use use) {
@@ -60,23 +81,35 @@ void write_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, const T* sampl
   });
 }
 
-// Reads the gradients of a radius as (num_azimuths, C).
+// Returns the step between the gradients of two points that read_points() reads.
 template <typename T>
-void read_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, T* to) {
+int64_t gradient_step(const PolarSampleArgs<T>& a) {
+  return a.tokens ? a.channels : round_up(a.channels, 4);
+}
+
+// Reads the gradients of points j to j + count of radius i. Planes are interleaved.
+template <typename T>
+void read_points(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
+                 T* to) {
   with_output_type(a, [&]<typename E>() {
     const Strides strides = output_strides(a);
     const E* from = static_cast<const E*>(a.grad_out) + output_start(a, b, i);
     if (a.tokens) {
-      for (int64_t j = 0; j < a.num_azimuths; j += a.samples_a) {
-        copy(from, strides.row, to);
-        from += strides.sector, to += strides.row;
+      from += j / a.samples_a * strides.sector;
+      for (int64_t sample = j % a.samples_a; count > 0; sample = 0, from += strides.sector) {
+        const int64_t part = smaller(a.samples_a - sample, count), values = part * a.channels;
+        copy(from + sample * a.channels, values, to);
+        count -= part, to += values;
       }
       return;
     }
-    for (int64_t j = 0; j < a.num_azimuths; ++j) {
-      for (int64_t c = 0; c < a.channels; ++c) {
-        to[j * a.channels + c] = load<T>(from + j + c * strides.channel);
+    const int64_t step = gradient_step(a);
+    for (int64_t c = 0; c < a.channels; c += 4) {
+      const E* plane[4];
+      for (int64_t e = 0; e < 4; ++e) {  // further channels are read, but never used
+        plane[e] = from + j + smaller(c + e, a.channels - 1) * strides.channel;
       }
+      interleave<T>(plane, count, to + c, step);
     }
   });
 }

@@ -47,9 +47,7 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
   for (int64_t item = begin; item < end; ++item) {
     const int64_t b = item / a.bands;
     Scatter<T> scatter(a, b, item % a.bands, scratch);
-    for (int64_t ring = 0; ring < a.num_radii / a.samples_r; ++ring) {
-      scatter.ring(ring);
-    }
+    scatter.add();
     scatter.finish();
   }
 }
@@ -87,7 +85,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     T* grad_offsets = a.grad_offsets == nullptr
                           ? nullptr
                           : a.grad_offsets + b * a.offsets_stride + i * a.num_azimuths;
-    read_row(a, b, i, grads);
+    read_points(a, b, i, 0, a.num_azimuths, grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {
@@ -105,7 +103,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
           const Corners<T, E> corners(a, b, places.column[k], places.row[k]);
           if (corners.outside()) continue;
           T gx, gy;
-          slope(corners, grads + (j + k) * a.channels, places.right[k], places.lower[k], &gx, &gy);
+          slope(corners, grads + (j + k) * gradient_step(a), places.right[k], places.lower[k], &gx, &gy);
           const double along = gx * points.across[k] + gy * points.down[k], shift = points.shift[k];
           sums[kAcross] += gx;
           sums[kDown] += gy;

@@ -23,7 +23,7 @@ class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
     const int64_t kept_rows = units(a.height, a.bands) + 3;  // at most
-    return round_up(sizeof(PlacedPoints<T>), 64) + a.samples_r * row_bytes(a) +
+    return round_up(sizeof(PlacedPoints<T>), 64) + tile_bytes(a) +
            kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }
 
@@ -38,7 +38,7 @@ class Scatter {
         points(*static_cast<PlacedPoints<T>*>(scratch)),
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
-        sums(grads + args.samples_r * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
+        sums(grads + tile_bytes(args) / sizeof(T) - first_kept() * layout.row) {
     if (keep == kDirect) {
       T* rows =
           static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
@@ -50,30 +50,19 @@ class Scatter {
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
-  // Adds the gradients of a ring.
-  void ring(int64_t ring) {
-    const int64_t first = ring * a.samples_r;
-    const auto read = [&](int64_t n, T* to) { read_row(a, image, first + n, to); };
-    if (keep == kDirect) {
+  // Adds the gradients of all points, a tile of points after the other: their pixels and gradients
+  // stay in the first-level cache.
+  void add() {
+    const int64_t tile_radii = keep == kCells ? 1 : 8;
+    const int64_t most = kBlock / tile_radii;
+    const int64_t tile_azimuths = a.tokens && a.samples_a <= most ? most - most % a.samples_a : most;
+    for (int64_t i = 0; i < a.num_radii; i += tile_radii) {
+      const int64_t radii = smaller(tile_radii, a.num_radii - i);
       bool any = false;
-      for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
-      if (!any) return;
-      const int64_t line_size = row_bytes(a) / sizeof(T);
-      for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line_size);
-      add_direct(first, line_size);
-      return;
-    }
-    for (int64_t n = 0; n < a.samples_r; ++n) {
-      if (!touches(first + n)) continue;
-      read(n, grads);
-      for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
-        const int64_t count = smaller(kBlock, a.num_azimuths - j);
-        points.find_packed(a, layout, image, first + n, j, count, 0);
-        if (keep == kCells) {
-          add_to_cells(count, grads + j * a.channels);
-        } else {
-          add_to_packed(count, grads + j * a.channels);
-        }
+      for (int64_t n = 0; n < radii; ++n) any |= touches(i + n);
+      for (int64_t j = 0; any && j < a.num_azimuths; j += tile_azimuths) {
+        const int64_t count = smaller(tile_azimuths, a.num_azimuths - j);
+        keep == kDirect ? tile_direct(i, radii, j, count) : tile_kept(i, radii, j, count);
       }
     }
   }
@@ -97,6 +86,11 @@ class Scatter {
 
  private:
   enum Keeping { kCells, kPacked, kDirect };
+
+  // The gradients of a tile. A load of four channels may reach beyond the last.
+  static int64_t tile_bytes(const PolarSampleArgs<T>& a) {
+    return round_up((kBlock * gradient_step(a) + 16) * sizeof(T), 64);
+  }
 
   // bfloat16 gradients never hold the sums, because these are float32.
   static Keeping keeping(const PolarSampleArgs<T>& a) {
@@ -130,8 +124,8 @@ class Scatter {
   }
 
   // A cell holds (upper left, upper right, lower left, lower right), with four channels each.
-  [[gnu::noinline]] void add_to_cells(int64_t count, const T* block) const {
-    const int64_t channels = a.channels;
+  [[gnu::noinline]] void add_to_cells(int64_t count, const T* from) const {
+    const int64_t step = gradient_step(a);
     const PackedPlaces<T>& places = points.packed;
     T* cells = sums;
     const int64_t begin = first_kept() * layout.row, end = end_kept() * layout.row;
@@ -139,7 +133,7 @@ class Scatter {
     in_turn(count, [=, &places](int64_t k) {
       const int64_t offset = places.offset[k];
       if (banded && (offset < begin || offset >= end)) return;
-      add_cell(cells + offset, block + k * channels, places.right[k], places.lower[k]);
+      add_cell(cells + offset, from + k * step, places.right[k], places.lower[k]);
     });
   }
 
@@ -190,17 +184,18 @@ class Scatter {
     }
   }
 
-  [[gnu::noinline]] void add_to_packed(int64_t count, const T* block) const {
+  [[gnu::noinline]] void add_to_packed(int64_t count, const T* from) const {
+    const int64_t step = gradient_step(a);
     if (a.bands > 1) {
-      in_turn(count, [=, this](int64_t k) { add_pixels<true>(k, block); });
+      in_turn(count, [=, this](int64_t k) { add_pixels<true>(k, from + k * step); });
     } else {
-      in_turn(count, [=, this](int64_t k) { add_pixels<false>(k, block); });
+      in_turn(count, [=, this](int64_t k) { add_pixels<false>(k, from + k * step); });
     }
   }
 
   // Adds a point to those of its rows that are in the band.
   template <bool kBanded>
-  void add_pixels(int64_t k, const T* block) const {
+  void add_pixels(int64_t k, const T* grad) const {
     using V = Piece<T>;
     const V down = splat<V>(points.packed.lower[k]), right = splat<V>(points.packed.right[k]);
     const V up = 1 - down, left = 1 - right;
@@ -209,7 +204,6 @@ class Scatter {
     const bool lower = !kBanded || in_band(offset + layout.row);
     T* top = sums + offset;
     T* bottom = top + layout.row;
-    const T* grad = block + k * a.channels;
     for (int64_t c = 0; c < pixel; c += kCount<V>) {
       const V g = load<V>(grad + c), above = unfused(g * up), below = unfused(g * down);
       if (upper) {
@@ -228,37 +222,42 @@ class Scatter {
     return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
   }
 
-  // Takes the same blocks of points as Sampler.
-  void add_direct(int64_t first, int64_t line_size) {
-    const int64_t strides[2] = {a.width, 1};
-    const int64_t token = a.samples_r * a.samples_a;
-    const int64_t columns =
-        smaller(token < kBlock ? kBlock / token * a.samples_a : a.samples_a, kBlock);
-    const int64_t rows = smaller(a.samples_r, kBlock / columns);
-    for (int64_t j = 0; j < a.num_azimuths; j += columns) {
-      const int64_t count = smaller(columns, a.num_azimuths - j);
-      for (int64_t row = 0; row < a.samples_r; row += rows) {
-        const int64_t end = smaller(row + rows, a.samples_r);
-        for (int64_t n = row; n < end; ++n) {
-          points.template find_direct<true>(a, strides, image, first + n, j, count,
-                                            (n - row) * count);
-        }
-        const auto add = [&](const Line& line) {
-          const int64_t step = line.flat ? a.channels : line_size;
-          const int64_t column = j + line.token * a.samples_a + line.sample;
-          const T* from = grads + (row + line.row) * line_size + column * a.channels;
-          for (int64_t k = 0; k < line.count; ++k) {
-            add_point(line.first + k * line.step, from + k * step);
-          }
-        };
-        const auto fetch = [&](const Line& line) {
-          const int64_t plane = a.height * a.width;
-          const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
-          fetch_pixels(points.direct, line, pixels, a.channels, plane, a.width);
-        };
-        visit_lines(Lines<T>(a, j, end - row, count, a.samples_a, true), fetch, add);
-      }
+  // Reads all gradients of a tile before any of them is used: a load of four channels that meets
+  // two stores waits until both are in the cache.
+  void read_tile(int64_t i, int64_t radii, int64_t j, int64_t count) {
+    for (int64_t n = 0; n < radii; ++n) {
+      read_points(a, image, i + n, j, count, grads + n * count * gradient_step(a));
     }
+  }
+
+  void tile_kept(int64_t i, int64_t radii, int64_t j, int64_t count) {
+    read_tile(i, radii, j, count);
+    for (int64_t n = 0; n < radii; ++n) {
+      if (!touches(i + n)) continue;
+      const T* from = grads + n * count * gradient_step(a);
+      points.find_packed(a, layout, image, i + n, j, count, 0);
+      keep == kCells ? add_to_cells(count, from) : add_to_packed(count, from);
+    }
+  }
+
+  void tile_direct(int64_t i, int64_t radii, int64_t j, int64_t count) {
+    const int64_t strides[2] = {a.width, 1}, gradient = gradient_step(a);
+    read_tile(i, radii, j, count);
+    for (int64_t n = 0; n < radii; ++n) {
+      points.template find_direct<true>(a, strides, image, i + n, j, count, n * count);
+    }
+    const auto add = [&](const Line& line) {
+      for (int64_t k = 0; k < line.count; ++k) {
+        const int64_t index = line.first + k * line.step;
+        add_point(index, grads + index * gradient);
+      }
+    };
+    const auto fetch = [&](const Line& line) {
+      const int64_t plane = a.height * a.width;
+      const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
+      fetch_pixels(points.direct, line, pixels, a.channels, plane, a.width);
+    };
+    visit_lines(Lines<T>(a, j, radii, count, 16, true), fetch, add);
   }
 
   void add_point(int64_t k, const T* grad) const {
@@ -296,7 +295,7 @@ class Scatter {
   const Packed layout;
   const int64_t image, first_row, end_row;
   PlacedPoints<T>& points;
-  T* grads;  // one row of gradients
+  T* grads;  // of a tile, or of one of its radii
   T* sums;   // cells or packed image; only the band's rows are there
 };
 

@@ -100,6 +100,22 @@ inline void transpose_quads(Floats* rows) {
   split_pairs<4>(rows, 1, even, odd);
 }
 
+// Stores four registers as pixels of four channels, one after the other.
+inline void interleave_four(Floats x, Floats y, Floats z, Floats w, float* to) {
+  constexpr int kL = kLanes<float>;
+  using Pairs = Vector<double, kL / 2>;
+  constexpr auto front = [](int i) { return i / 2 + i % 2 * kL; };
+  constexpr auto back = [](int i) { return kL / 2 + i / 2 + i % 2 * kL; };
+  constexpr auto front_pairs = [](int i) { return i / 2 + i % 2 * (kL / 2); };
+  constexpr auto back_pairs = [](int i) { return kL / 4 + i / 2 + i % 2 * (kL / 2); };
+  const auto xy = (Pairs)shuffle<front>(x, y), zw = (Pairs)shuffle<front>(z, w);
+  const auto xy2 = (Pairs)shuffle<back>(x, y), zw2 = (Pairs)shuffle<back>(z, w);
+  store(to, (Floats)shuffle<front_pairs>(xy, zw));
+  store(to + kL, (Floats)shuffle<back_pairs>(xy, zw));
+  store(to + 2 * kL, (Floats)shuffle<front_pairs>(xy2, zw2));
+  store(to + 3 * kL, (Floats)shuffle<back_pairs>(xy2, zw2));
+}
+
 // Writes the transpose of a square of kLanes x kLanes. The rows of `to` are `stride` apart. The
 // first part transposes each 4 x 4 square within 128 bits. The second part transposes the blocks of
 // 128 bits among themselves.
