@@ -108,7 +108,7 @@ struct PolarCall {
     take_jitter(given);
     take_normalization(given);
     take_directions(azimuths);
-    choose_reading();
+    choose_reading(args.channels);
   }
 
   int64_t rings() const { return args.num_radii / args.samples_r; }
@@ -125,6 +125,24 @@ struct PolarCall {
     return sampling_microseconds(batch * points, args.channels);
   }
 
+  // Chooses whether the image is packed, `channels` at a time. If it is not, chooses whether it is
+  // read by gathers. docs/performance.md shows the cases in which gathers are faster than loads.
+  // For other images they take up to twice as long.
+  void choose_reading(int64_t channels) {
+    const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
+    const double points =
+        static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
+    // A packed image of 8 bits needs a channel for its coverage.
+    args.packed = packed_values(channels) * sizeof(T) <= kPackedBytes &&
+                  pixels <= kPackedPixels * points &&
+                  (args.pixel != Pixel::u8 || args.channels < 4);
+    const bool gray = args.channels == 1;
+    const bool possible = current_tier() == Tier::avx512 && !args.packed &&
+                          args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
+                          (gray || args.channels == 3);
+    args.gathers = possible && (cpu_is_intel() || (gray && pixels <= kGatheredPixels));
+  }
+
   // Returns the number of bands of rows into which backward cuts an image. Bands let a small batch
   // of large images use all threads. They also limit the memory that a thread needs for the sums of
   // bfloat16 pixels.
@@ -133,7 +151,7 @@ struct PolarCall {
     int64_t bands = 1;
     if (batch > 0 && batch < 4 * threads) bands = threads / std::gcd(batch, threads);
     if (args.pixel == Pixel::bf16) {
-      const double bytes = packed_values() * sizeof(T);
+      const double bytes = packed_values(args.channels) * sizeof(T);
       bands = std::max<int64_t>(bands, static_cast<int64_t>(bytes / kSumsBytes) + 1);
     }
     return std::clamp<int64_t>(bands, 1, std::max<int64_t>(args.height, 1));
@@ -148,7 +166,7 @@ struct PolarCall {
   Tensor new_image_gradient() {
     STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
     // Sums of bfloat16 pixels are kept in packed form for every size, with 32-bit indices.
-    STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed_values() < 2147483648.0,
+    STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed_values(args.channels) < 2147483648.0,
                     "polar_sample_backward: too large an image for a bfloat16 gradient");
     // If there are points, the kernels write every pixel.
     const Tensor grad =
@@ -255,28 +273,11 @@ struct PolarCall {
         std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
   }
 
-  // Chooses whether the image is packed. If it is not, chooses whether it is read by gathers.
-  // docs/performance.md shows the cases in which gathers are faster than loads. For other images
-  // they take up to twice as long.
-  void choose_reading() {
-    const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
-    const double points =
-        static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
-    // A packed image of 8 bits needs a channel for its coverage.
-    args.packed = packed_values() * sizeof(T) <= kPackedBytes && pixels <= kPackedPixels * points &&
-                  (args.pixel != Pixel::u8 || args.channels < 4);
-    const bool gray = args.channels == 1;
-    const bool possible = current_tier() == Tier::avx512 && !args.packed &&
-                          args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
-                          (gray || args.channels == 3);
-    args.gathers = possible && (cpu_is_intel() || (gray && pixels <= kGatheredPixels));
-  }
-
-  // Returns the number of values in the kernels' packed image. It is a double, because it may not
-  // fit 64 bits.
-  double packed_values() const {
+  // Returns the number of values in the kernels' packed image of so many channels. It is a double,
+  // because it may not fit 64 bits.
+  double packed_values(int64_t channels) const {
     return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
-           static_cast<double>(round_up(args.channels, 4));
+           static_cast<double>(round_up(channels, 4));
   }
 
   // Adds up the sums of each row of points into the gradients of radii, center and affine.

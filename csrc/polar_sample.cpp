@@ -34,6 +34,7 @@ void choose_layout(PolarSampleArgs<T>& args, bool tokens) {
 template <typename T>
 Tensor forward(PolarCall<T>& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
+  if (!tokens) call.choose_reading(4);  // planes are packed by fours
   choose_layout(args, tokens);
   const Tensor out = new_tensor(output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;

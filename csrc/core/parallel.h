@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <limits>
 #include <memory>
 #include <new>
@@ -47,6 +48,9 @@ class ThreadMemoryOf {
     if (memory == nullptr) throw std::bad_alloc();
     ask_for_large_pages(memory.get(), bytes);
     size = bytes;
+#if defined(__SANITIZE_ADDRESS__)  // numbers that nobody wrote are NaN, so that tests find them
+    std::memset(memory.get(), 0xFF, bytes);
+#endif
   }
   ~ThreadMemoryOf() {
     if (size > kKept) free();

@@ -181,12 +181,13 @@ class Lines {
       flat = !planes || sin * sin > cos * cos;
     }
     const int64_t at = index++, from = column, in = token;
-    if (index == (flat ? rows : width)) {
+    const int64_t points = smaller(width, columns - column);  // of a radius of this token
+    if (index == (flat ? rows : points)) {
       index = 0;
       column += width;
       ++token;
     }
-    if (flat) return {true, at, in, 0, at * columns + from, 1, width};
+    if (flat) return {true, at, in, 0, at * columns + from, 1, points};
     return {false, 0, in, at, from + at, columns, rows};
   }
 

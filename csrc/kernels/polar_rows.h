@@ -65,16 +65,17 @@ void with_output_type(const PolarSampleArgs<T>& a, Use use) {
   use.template operator()<T>();
 }
 
-// Writes the samples of a radius to the output: (num_azimuths, C) for tokens, else (C,
-// num_azimuths).
+// Writes the samples of a radius to the output: (num_azimuths, C) for tokens, else the planes
+// (channels, num_azimuths) of the channels from `channel` on.
 template <typename T>
-void write_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, const T* samples) {
+void write_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t channel, int64_t channels,
+               const T* samples) {
   with_output_type(a, [&]<typename E>() {
     const Strides strides = output_strides(a);
-    E* out = static_cast<E*>(a.out) + output_start(a, b, i);
+    E* out = static_cast<E*>(a.out) + output_start(a, b, i) + channel * strides.channel;
     const int64_t piece = a.tokens ? strides.row : a.num_azimuths;
     const int64_t step = a.tokens ? strides.sector : strides.channel;
-    for (int64_t values = a.num_azimuths * a.channels; values > 0; values -= piece) {
+    for (int64_t values = a.num_azimuths * channels; values > 0; values -= piece) {
       copy(samples, piece, out);
       samples += piece, out += step;
     }

@@ -29,15 +29,24 @@ void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scrat
     (a.tokens ? strides.sector : strides.channel) = a.tokens ? piece : a.num_azimuths;
   }
   Sampler<T> sampler(a, strides, scratch);
-  for (int64_t item = begin; item < end; ++item) {
-    const int64_t b = item / rings, ring = item % rings, first = ring * a.samples_r;
+  const auto sample_ring = [&](int64_t b, int64_t ring, int64_t channel) {
+    const int64_t first = ring * a.samples_r;
     if (!a.narrow) {
-      sampler.ring(b, ring, static_cast<T*>(a.out) + output_start(a, b, first));
-      continue;
+      const int64_t start = output_start(a, b, first) + channel * strides.channel;
+      return sampler.ring(ring, static_cast<T*>(a.out) + start);
     }
-    sampler.ring(b, ring, samples);
+    sampler.ring(ring, samples);
     for (int64_t n = 0; n < a.samples_r; ++n) {
-      write_row(a, b, first + n, samples + n * values);
+      write_row(a, b, first + n, channel, sampler.channels, samples + n * values);
+    }
+  };
+  // The rings of an image, for the channels that the sampler takes at a time.
+  for (int64_t item = begin, last; item < end; item = last) {
+    const int64_t b = item / rings;
+    last = smaller(end, (b + 1) * rings);
+    for (int64_t channel = 0; channel < a.channels; channel += sampler.channels) {
+      sampler.take(b, channel);
+      for (int64_t k = item; k < last; ++k) sample_ring(b, k % rings, channel);
     }
   }
 }
@@ -103,7 +112,8 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
           const Corners<T, E> corners(a, b, places.column[k], places.row[k]);
           if (corners.outside()) continue;
           T gx, gy;
-          slope(corners, grads + (j + k) * gradient_step(a), places.right[k], places.lower[k], &gx, &gy);
+          slope(corners, grads + (j + k) * gradient_step(a), places.right[k], places.lower[k], &gx,
+                &gy);
           const double along = gx * points.across[k] + gy * points.down[k], shift = points.shift[k];
           sums[kAcross] += gx;
           sums[kDown] += gy;

@@ -11,8 +11,10 @@ namespace {
 template <typename T>
 class Sampler {
  public:
+  int64_t channels = 0;  // that take() has taken
+
   static int64_t bytes(const PolarSampleArgs<T>& a) {
-    const int64_t values = a.packed ? packed_values(a) + 16 + 4 * a.width : 0;
+    const int64_t values = a.packed ? packed_layout(a).size + 16 + 4 * a.width : 0;
     return round_up(sizeof(State), 64) + round_up(values * sizeof(T), 64);
   }
 
@@ -28,7 +30,7 @@ class Sampler {
                 (args.samples_a <= kBlock || args.samples_r == 1) && reach_of_block() < INT32_MAX),
         state(*static_cast<State*>(scratch)),
         points(state.points),
-        image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
+        pixels(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
     if (!in_line) return;
     int64_t k = 0;
     for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
@@ -43,17 +45,18 @@ class Sampler {
     }
   }
 
-  // Samples the tokens of a ring of image b.
-  void ring(int64_t b, int64_t ring, T* to) {
-    if (a.packed && b != image_in_hand) {
-      with_pixel_type<T>(a.pixel, [&]<typename E>() {
-        T* to = image;
-        for (int64_t c = 0; c < a.channels; c += packed.pixel, to += packed.size) {
-          pack<T, E>(a, packed, b, c, image + packed_values(a) + 16, to);
-        }
-      });
-      image_in_hand = b;
-    }
+  // Takes the channels of image b from `first` on: four planes of a packed image, else all.
+  void take(int64_t image, int64_t first) {
+    b = image;
+    channels = a.packed && !a.tokens ? smaller(a.channels - first, packed.pixel) : a.channels;
+    if (!a.packed) return;
+    with_pixel_type<T>(a.pixel, [&]<typename E>() {
+      pack<T, E>(a, packed, b, first, pixels + packed.size + 16, pixels);
+    });
+  }
+
+  // Samples the tokens of a ring of the image.
+  void ring(int64_t ring, T* to) {
     ring_inside = a.packed && a.pixel == Pixel::u8;  // not needed otherwise
     for (int64_t n = 0; n < a.samples_r && ring_inside; ++n) {
       ring_inside = points.inside(a, b, ring * a.samples_r + n);
@@ -65,7 +68,7 @@ class Sampler {
           columns < a.samples_a ? a.samples_a - j % a.samples_a : a.num_azimuths - j;
       count = smaller(columns, left);
       for (int64_t row = 0; row < a.samples_r; row += rows) {
-        block(b, ring, j, count, row, smaller(rows, a.samples_r - row), to);
+        block(ring, j, count, row, smaller(rows, a.samples_r - row), to);
       }
     }
   }
@@ -78,14 +81,9 @@ class Sampler {
     T samples[4 * kBlock];
   };
 
-  // A packed image has all channels of a pixel. If the samples are planes, it has four channels,
-  // and further images with the next four follow.
+  // A packed image has all channels of a pixel, or four of them if the samples are planes.
   static Packed packed_layout(const PolarSampleArgs<T>& a) {
     return a.packed ? Packed(a, a.tokens ? round_up(a.channels, 4) : 4) : Packed();
-  }
-  static int64_t packed_values(const PolarSampleArgs<T>& a) {
-    const Packed packed = packed_layout(a);
-    return units(a.channels, packed.pixel) * packed.size;
   }
 
   // Returns whether polar_bytes.h samples the image.
@@ -116,7 +114,7 @@ class Sampler {
   }
 
   // Samples points j to j + count of `rows` radii of a ring, starting at its radius `row`.
-  void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
+  void block(int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
     const int64_t first = ring * a.samples_r + row;
     T* out = to + j / a.samples_a * strides.sector + j % a.samples_a * strides.sample +
              row * strides.row;
@@ -126,10 +124,10 @@ class Sampler {
                                            n * count);
       }
       if (reads_bytes(a)) {
-        sample_bytes(b, rows * count);
+        sample_bytes(rows * count);
         return spread(rows, count, out);
       }
-      with_pixel_type<T>(a.pixel, [&]<typename E>() { direct_lines<E>(b, j, rows, count, out); });
+      with_pixel_type<T>(a.pixel, [&]<typename E>() { direct_lines<E>(j, rows, count, out); });
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
@@ -151,7 +149,7 @@ class Sampler {
       const bool last = row + rows == a.samples_r && a.samples_r > 1;
       const int64_t all = rows * count, last_row = last ? all - count : all - 3;
       return with_normalization([&]<Normalization how>() {
-        sample_points<how>(a, image, packed.row, points.packed, last_row, all, state.targets, out);
+        sample_points<how>(a, pixels, packed.row, points.packed, last_row, all, state.targets, out);
       });
     }
     for (int64_t n = 0; n < rows; ++n) {
@@ -172,13 +170,9 @@ class Sampler {
   // Samples the planes of a block, `rows` times `count` points of a packed image.
   void planes(int64_t rows, int64_t count, T* to) const {
     with_normalization([&]<Normalization how>() {
-      const T* pixels = image;
-      for (int64_t c = 0; c < a.channels; c += packed.pixel, pixels += packed.size) {
-        for (int64_t n = 0; n < rows; ++n) {
-          sample_planes<how>(a, pixels, packed.row, points.packed, n * count, count,
-                             smaller(a.channels - c, 4), strides.channel,
-                             to + n * strides.row + c * strides.channel);
-        }
+      for (int64_t n = 0; n < rows; ++n) {
+        sample_planes<how>(a, pixels, packed.row, points.packed, n * count, count, channels,
+                           strides.channel, to + n * strides.row);
       }
     });
   }
@@ -188,7 +182,7 @@ class Sampler {
   void packed_row(int64_t j, int64_t count, int64_t first, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
       T* to = row + (j + k) / a.samples_a * strides.sector + (j + k) % a.samples_a * a.channels;
-      const T* pixel = image + points.packed.offset[first + k];
+      const T* pixel = pixels + points.packed.offset[first + k];
       const T right = points.packed.right[first + k], lower = points.packed.lower[first + k];
       const T *below = pixel + packed.row, *next = pixel + packed.pixel,
               *opposite = below + packed.pixel;
@@ -212,7 +206,7 @@ class Sampler {
   int64_t point_step() const { return a.tokens ? a.channels : 1; }
 
   // Samples the first `count` points of a block of bytes, one after the other.
-  void sample_bytes(int64_t b, int64_t count) const {
+  void sample_bytes(int64_t count) const {
     if constexpr (is_same_v<T, float>) {
       const int64_t* stride = a.image_stride;
       const ByteImage bytes{static_cast<const uint8_t*>(a.image) + b * stride[0],
@@ -277,23 +271,22 @@ class Sampler {
   // token has more samples there, which come later. This holds for all lines except those that end
   // a row of the token.
   template <typename E>
-  [[gnu::noinline]] void direct_lines(int64_t b, int64_t j, int64_t rows, int64_t count,
-                                      T* to) const {
-    const DirectImage<T, E> pixels(a, b, points.direct);
+  [[gnu::noinline]] void direct_lines(int64_t j, int64_t rows, int64_t count, T* to) const {
+    const DirectImage<T, E> image(a, b, points.direct);
     if (a.gathers) {
-      pixels.block(rows * count, {state.samples, point_step(), channel_step(), false});
+      image.block(rows * count, {state.samples, point_step(), channel_step(), false});
       return spread(rows, count, to);
     }
     const bool joined = rows == 1 && strides.sector == a.samples_a * strides.sample;
-    const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, pixels.planes() > 1);
-    const auto fetch = [&](const Line& line) { pixels.fetch(line); };
+    const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, image.planes() > 1);
+    const auto fetch = [&](const Line& line) { image.fetch(line); };
     const int64_t width = smaller(a.samples_a, count);
     visit_lines(lines, fetch, [&](const Line& line) {
       T* out =
           to + line.token * strides.sector + line.sample * strides.sample + line.row * strides.row;
       const int64_t step = line.flat ? strides.sample : strides.row;
       const bool spare = a.tokens && !line.flat && line.sample + 1 < width;
-      pixels.sample(line, {out, step, strides.channel, spare});
+      image.sample(line, {out, step, strides.channel, spare});
     });
   }
 
@@ -303,8 +296,8 @@ class Sampler {
   const bool in_line;
   State& state;
   PlacedPoints<T>& points;
-  T* image;  // packed image, then the rows that pack() converts
-  int64_t image_in_hand = -1;
+  T* pixels;                 // packed image, then the rows that pack() converts
+  int64_t b = 0;             // the image in hand
   bool ring_inside = false;  // all pixels around the points of the ring in hand are in the image
 };
 

@@ -11,6 +11,7 @@
 // the points are taken from several arcs of the circle in turn.
 #pragma once
 
+#include "polar_direct.h"
 #include "polar_rows.h"
 
 namespace darswin {
@@ -53,9 +54,10 @@ class Scatter {
   // Adds the gradients of all points, a tile of points after the other: their pixels and gradients
   // stay in the first-level cache.
   void add() {
-    const int64_t tile_radii = keep == kCells ? 1 : 8;
-    const int64_t most = kBlock / tile_radii;
-    const int64_t tile_azimuths = a.tokens && a.samples_a <= most ? most - most % a.samples_a : most;
+    // All of a ring for cells, whose sums wait longest for each other.
+    const int64_t tile_radii = keep == kCells ? 1 : 8, most = kBlock / tile_radii;
+    const int64_t tile_azimuths =
+        a.tokens && a.samples_a <= most ? most - most % a.samples_a : most;
     for (int64_t i = 0; i < a.num_radii; i += tile_radii) {
       const int64_t radii = smaller(tile_radii, a.num_radii - i);
       bool any = false;
@@ -273,6 +275,18 @@ class Scatter {
     const T down_left = by_down * by_left, down_right = by_down * by_right;
     const int64_t plane = a.height * a.width;
     T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
+    if constexpr (is_same_v<T, float>) {
+      if (upper && lower && left && next) {
+        const Vector<float, 4> share{up_left, up_right, down_left, down_right};
+        for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
+          const auto sum = two_pairs(pixel, pixel + a.width) + unfused(grad[c] * share);
+          const auto pairs = (Vector<double, 2>)sum;
+          store_bits(pixel, pairs[0]);
+          store_bits(pixel + a.width, pairs[1]);
+        }
+        return;
+      }
+    }
     for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
       if (upper && left) pixel[0] += unfused(grad[c] * up_left);
       if (upper && next) pixel[1] += unfused(grad[c] * up_right);
