@@ -12,16 +12,16 @@ namespace {
 
 constexpr int64_t kMostReads = 16;       // along a side of a pixel: all points fit one block
 constexpr double kPerMicrosecond = 500;  // points, or numbers of a frame that are normalized
-constexpr int64_t kShortGap = 32;        // points: to sample them takes less than to skip them
+constexpr int64_t kShortGap = 8;         // points: to sample them takes less than to skip them
 
 int64_t length(const std::vector<PixelRun>& runs) {
   return runs.empty() ? 0 : runs.back().before + runs.back().end - runs.back().begin;
 }
 
-// Adds a pixel to the last run if it is in the same picture and at most `gap` pixels behind. Else
-// it begins a run.
-void add(int64_t pixel, int64_t picture, int64_t gap, std::vector<PixelRun>& runs) {
-  if (!runs.empty() && runs.back().begin >= picture && pixel - runs.back().end <= gap) {
+// Adds a pixel to the last run if at most `gap` pixels lie between, in the picture that begins with
+// `first`. Else the pixel begins a run.
+void add(int64_t pixel, int64_t first, int64_t gap, std::vector<PixelRun>& runs) {
+  if (!runs.empty() && runs.back().begin >= first && pixel - runs.back().end <= gap) {
     runs.back().end = pixel + 1;
   } else {
     runs.push_back({pixel, pixel + 1, length(runs)});
@@ -70,20 +70,19 @@ FrameSampler::FrameSampler(const FramePlan& plan)
     const int64_t x = plan.columns[k], y = plan.rows[k];
     return x >= 0 && y >= 0 && x < width - 1 && y < height - 1;
   };
-  const auto sees = [&](int64_t k) {
+  const auto is_seen = [&](int64_t k) {
     const int64_t x = plan.columns[k], y = plan.rows[k];
     return x >= -1 && y >= -1 && x < width && y < height;
   };
   pixels = static_cast<int64_t>(points) / reads;
-  pictures = !tokens && shape.size() == 3 ? shape[0] : 1;
-  for (int64_t pixel = 0, picture = 0; pixel < pixels; ++pixel) {
-    if (pixel - picture == pixels / pictures) picture = pixel;
+  picture = !tokens && shape.size() == 3 && shape[0] > 0 ? pixels / shape[0] : pixels;
+  for (int64_t pixel = 0, first = 0; pixel < pixels; ++pixel) {
+    if (pixel - first == picture) first = pixel;
+    const int64_t begin = pixel * reads, end = begin + reads;
     bool all_inside = true, any_seen = false;
-    for (int64_t k = pixel * reads; k < (pixel + 1) * reads; ++k) {
-      all_inside &= is_inside(k), any_seen |= sees(k);
-    }
-    any_seen ? add(pixel, picture, kShortGap / reads, seen) : add(pixel, picture, 0, outside);
-    for (int64_t k = pixel * reads; k < (pixel + 1) * reads && any_seen && !all_inside; ++k) {
+    for (int64_t k = begin; k < end; ++k) all_inside &= is_inside(k), any_seen |= is_seen(k);
+    any_seen ? add(pixel, first, kShortGap / reads, seen) : add(pixel, first, 0, outside);
+    for (int64_t k = begin; k < end && any_seen && !all_inside; ++k) {
       border.push_back({pixel, plan.columns[k], plan.rows[k], plan.right[k], plan.lower[k]});
     }
   }
@@ -98,7 +97,7 @@ FrameSampler::FrameSampler(const FramePlan& plan)
   }
 }
 
-int64_t FrameSampler::pixel_behind(int64_t count) const {
+int64_t FrameSampler::pixel_after(int64_t count) const {
   const auto is_behind = [](int64_t count, const PixelRun& run) { return count < run.before; };
   const auto run = std::upper_bound(seen.begin(), seen.end(), count, is_behind) - 1;
   return run->begin + count - run->before;
@@ -153,19 +152,19 @@ void FrameSampler::sample(const Frame& frame, void* out) const {
   a.image = image_of(frame, scales, offsets);
   a.columns = columns.data(), a.rows = rows.data();
   a.right = right.data(), a.lower = lower.data();
-  a.reads = reads, a.pixels = pictures > 0 ? pixels / pictures : 0;
+  a.reads = reads, a.pixels = picture;
   a.seen = runs_of(seen), a.outside = runs_of(outside);
   a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
   a.output = kind;
   a.out = out;
   const auto& kernel = kernels<FrameKernels>();
   const int64_t work = length(seen);
-  // Shares of the work; what lies outside hardly counts.
+  // Threads share what is seen. The rest hardly takes time.
   parallel_ranges(std::max<int64_t>(work, 1),
                   threads_for(static_cast<double>(work * reads) / kPerMicrosecond),
                   [&](int64_t begin, int64_t end) {
-                    kernel.sample(a, begin > 0 ? pixel_behind(begin) : 0,
-                                  end < work ? pixel_behind(end) : pixels);
+                    kernel.sample(a, begin > 0 ? pixel_after(begin) : 0,
+                                  end < work ? pixel_after(end) : pixels);
                   });
 }
 

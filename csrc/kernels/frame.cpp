@@ -4,6 +4,8 @@
 namespace darswin {
 namespace {
 
+constexpr int64_t kPart = 16384;  // pixels that stay in the cache while several loops write to them
+
 // Finds the offsets of points [first, first + count).
 void find_offsets(const FrameArgs& a, int64_t first, int64_t count, int32_t* offset) {
   const auto row_stride = static_cast<int32_t>(a.image.row_stride),
@@ -66,9 +68,9 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlo
 void write_zeros(const FrameArgs& a, int64_t first, int64_t count) {
   const int64_t channels = a.image.channels;
   if (a.output == FrameOutput::planes) {
+    float* plane = static_cast<float*>(a.out) + in_planes(a, first, 0);
     for (int64_t c = 0; c < channels; ++c) {
-      __builtin_memset(static_cast<float*>(a.out) + in_planes(a, first, c), 0,
-                       static_cast<size_t>(count) * sizeof(float));
+      __builtin_memset(plane + c * a.pixels, 0, static_cast<size_t>(count) * sizeof(float));
     }
     return;
   }
@@ -97,40 +99,37 @@ void write_border(const FrameArgs& a, const BorderPoint* points) {
   }
 }
 
-// The first of so many items for which `is_behind` holds, as it does for all after it.
+// The first of so many items for which the condition holds. It holds for all items after that.
 template <typename Item, typename Condition>
-const Item* first_of(const Item* items, int64_t count, Condition is_behind) {
-  while (count > 0) {
-    const int64_t half = count / 2;
-    if (is_behind(items[half])) {
-      count = half;
-    } else {
-      items += half + 1, count -= half + 1;
-    }
+const Item* first_of(const Item* items, int64_t count, Condition condition) {
+  int64_t low = 0;
+  while (low < count) {
+    const int64_t middle = (low + count) / 2;
+    condition(items[middle]) ? count = middle : low = middle + 1;
   }
-  return items;
+  return items + low;
 }
 
-// Calls body(pixel, last, place) on the parts of runs that are in [begin, end): pixels [pixel,
-// last). So many pixels of the runs come before.
+// Calls body(pixel, last, before) for the parts [pixel, last) of runs that are in [begin, end),
+// with so many pixels of the runs before.
 template <typename Body>
 void for_runs(const PixelRuns& all, int64_t begin, int64_t end, Body body) {
   const PixelRun* last = all.runs + all.count;
-  const auto is_behind = [&](const PixelRun& run) { return run.end > begin; };
-  for (const PixelRun* run = first_of(all.runs, all.count, is_behind);
-       run < last && run->begin < end; ++run) {
+  const auto reaches = [&](const PixelRun& run) { return run.end > begin; };
+  for (const PixelRun* run = first_of(all.runs, all.count, reaches); run < last && run->begin < end;
+       ++run) {
     const int64_t first = run->begin > begin ? run->begin : begin;
     body(first, smaller(run->end, end), run->before + first - run->begin);
   }
 }
 
-void sample(const FrameArgs& a, int64_t begin, int64_t end) {
-  alignas(64) ByteBlock block;
+// Samples pixels [begin, end). What lies outside in short gaps is sampled first, and then zero.
+void sample_part(const FrameArgs& a, int64_t begin, int64_t end, ByteBlock& block) {
   const int64_t most = kByteBlock / a.reads;
-  const auto sample_run = [&](int64_t pixel, int64_t last, int64_t place) {
-    for (int64_t count; pixel < last; pixel += count, place += count) {
+  const auto sample_run = [&](int64_t pixel, int64_t last, int64_t before) {
+    for (int64_t count; pixel < last; pixel += count, before += count) {
       count = smaller(most, last - pixel);
-      const int64_t first = place * a.reads;
+      const int64_t first = before * a.reads;
       find_offsets(a, first, count * a.reads, block.offset);
       block.sample(a.image, a.right + first, a.lower + first, count * a.reads);
       if (a.reads > 1) average(a, count, block);
@@ -142,10 +141,18 @@ void sample(const FrameArgs& a, int64_t begin, int64_t end) {
   for_runs(a.outside, begin, end,
            [&](int64_t pixel, int64_t last, int64_t) { write_zeros(a, pixel, last - pixel); });
   const BorderPoint* last = a.border + a.border_points;
-  const auto is_behind = [&](const BorderPoint& point) { return point.pixel >= begin; };
-  for (const BorderPoint* point = first_of(a.border, a.border_points, is_behind);
+  const auto is_in = [&](const BorderPoint& point) { return point.pixel >= begin; };
+  for (const BorderPoint* point = first_of(a.border, a.border_points, is_in);
        point < last && point->pixel < end; point += a.reads) {
     write_border(a, point);
+  }
+}
+
+void sample(const FrameArgs& a, int64_t begin, int64_t end) {
+  alignas(64) ByteBlock block;
+  for (int64_t next; begin < end; begin = next) {
+    next = smaller(begin + kPart, end);
+    sample_part(a, begin, next, block);
   }
 }
 
