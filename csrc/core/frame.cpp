@@ -89,11 +89,15 @@ FrameSampler::FrameSampler(const FramePlan& plan)
   const size_t kept = length(seen) * reads + kFrameSpare;
   columns.resize(kept), rows.resize(kept), right.resize(kept), lower.resize(kept);
   for (const PixelRun& run : seen) {
-    int64_t to = run.before * reads;
-    for (int64_t k = run.begin * reads; k < run.end * reads; ++k, ++to) {
-      if (is_inside(k)) columns[to] = plan.columns[k], rows[to] = plan.rows[k];
-      right[to] = plan.right[k], lower[to] = plan.lower[k];
+    const int64_t first = run.begin * reads, count = (run.end - run.begin) * reads;
+    const int64_t to = run.before * reads;
+    for (int64_t k = 0; k < count; ++k) {
+      const bool inside = is_inside(first + k);
+      columns[to + k] = inside ? plan.columns[first + k] : 0;
+      rows[to + k] = inside ? plan.rows[first + k] : 0;
     }
+    std::copy_n(plan.right.begin() + first, count, right.begin() + to);
+    std::copy_n(plan.lower.begin() + first, count, lower.begin() + to);
   }
 }
 
