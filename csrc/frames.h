@@ -17,22 +17,33 @@ struct ByteImage {
   const float *scale, *offset;  // (C,): a sample v of the pixels becomes v * scale + offset
 };
 
-// A point whose four pixels are not all inside the frame.
+// A point of a pixel of the output that reads the frame's border: some of the pixels around its
+// points are inside the frame, and some are not.
 struct BorderPoint {
-  int64_t index;
+  int64_t pixel;
   int16_t column, row;
   float right, lower;
 };
 
+// Pixels [begin, end) of one picture of the output, with so many pixels in the runs before.
+struct PixelRun {
+  int64_t begin, end, before;
+};
+struct PixelRuns {
+  const PixelRun* runs;
+  int64_t count;
+};
+
 struct FrameArgs {
   ByteImage image;
-  // The upper left pixels of the points; 0, 0 for points of `border`. kFrameSpare more are readable
-  // behind these arrays.
+  // The upper left pixels of the points of all pixels in `seen`; 0, 0 if their neighbours are not
+  // all inside. kFrameSpare more are readable behind these arrays.
   const int16_t *columns, *rows;
   const float *right, *lower;  // distances from that pixel, 0 to 1
-  int64_t points;
-  int64_t reads;   // points of a pixel of the output, one after the other: it is their mean
-  int64_t pixels;  // of one picture of the output
+  int64_t reads;      // points of a pixel of the output, one after the other: it is their mean
+  int64_t pixels;     // of one picture of the output
+  PixelRuns seen;     // all pixels that see something of the frame, and those in short gaps
+  PixelRuns outside;  // all pixels that see nothing
   const BorderPoint* border;
   int64_t border_points;
   FrameOutput output;
@@ -46,7 +57,7 @@ struct FrameKernels {
   // `padded` numbers, a multiple of 8 and at least 8 more than the azimuths.
   void (*places)(PolarSampleArgs<float> args, double* angles, int64_t padded, int16_t* columns,
                  int16_t* rows, float* right, float* lower);
-  // Samples points [begin, end), of whole pixels, on one thread.
+  // Samples pixels [begin, end) of the output on one thread.
   void (*sample)(const FrameArgs& args, int64_t begin, int64_t end);
 };
 

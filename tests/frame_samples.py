@@ -1,5 +1,6 @@
 """Random frames and small networks for tests of darswin.frames, and bilinear samples by NumPy."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,22 @@ def bilinear(image, x, y):
     top = padded[row, column] * (1 - right) + padded[row, column + 1] * right
     bottom = padded[row + 1, column] * (1 - right) + padded[row + 1, column + 1] * right
     return top * (1 - lower) + bottom * lower
+
+
+def by_numpy(plan, frame):
+    """The mean of bilinear samples in float64, with normalized zeros outside of the frame."""
+    pixels = frame.reshape(*frame.shape[:2], -1).astype(np.float64)
+    if plan.output != "uint8":
+        pixels = (pixels / 255 - np.array(plan.mean)) / np.array(plan.std)
+    right, lower = plan.right.astype(float), plan.lower.astype(float)
+    found = bilinear(pixels, plan.columns + right, plan.rows + lower)
+    if plan.supersampling > 1:
+        found = found.mean(-2)
+    if plan.output == "image":
+        return np.moveaxis(found, -1, -3)
+    if plan.output == "tokens":
+        return found.reshape(*found.shape[:2], math.prod(found.shape[2:]))
+    return found if frame.ndim == 3 else found[..., 0]
 
 
 def model_of(family="darswin_a", channels=3, *, size="nano", **options):

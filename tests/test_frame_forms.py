@@ -17,6 +17,8 @@ from graphs import write_detector
 
 from darswin.frames.onnx import OnnxNetwork
 
+pytestmark = pytest.mark.unsanitized  # nothing of it is compiled
+
 SIZE = HEIGHT, WIDTH = 160, 224
 K = 12
 RANDOM = np.random.default_rng(5)

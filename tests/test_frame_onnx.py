@@ -13,6 +13,8 @@ from graphs import DETECTORS, write_detector, write_graph
 
 from darswin.frames.onnx import OnnxNetwork
 
+pytestmark = pytest.mark.unsanitized  # nothing of it is compiled
+
 SIZE = (16, 24)
 # Of three pictures: the box and the channel of its light; the last one is empty.
 BOXES = [((5, 3, 20, 9), 1), ((0, 0, 24, 16), 2), None]

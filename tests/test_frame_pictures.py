@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from frame_samples import MEAN, STD, bilinear, random_frame
+from frame_samples import MEAN, STD, bilinear, by_numpy, random_frame
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,20 +17,6 @@ from darswin.views import make_view
 
 SIZE = (120, 160)
 LENS = KannalaBrandt(40.0, [0.01], math.radians(95), center=[81.0, 58.0])
-
-
-def by_numpy(plan, frame):
-    """The mean of bilinear samples in float64, with normalized zeros outside of the frame."""
-    pixels = frame.reshape(*frame.shape[:2], -1).astype(np.float64)
-    if plan.output == "image":
-        pixels = (pixels / 255 - np.array(plan.mean)) / np.array(plan.std)
-    right, lower = plan.right.astype(float), plan.lower.astype(float)
-    found = bilinear(pixels, plan.columns + right, plan.rows + lower)
-    if plan.supersampling > 1:
-        found = found.mean(-2)
-    if plan.output == "image":
-        return np.moveaxis(found, -1, -3)
-    return found if frame.ndim == 3 else found[..., 0]
 
 
 @st.composite

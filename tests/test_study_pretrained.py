@@ -16,6 +16,7 @@ import pretrained_files
 import pretrained_methods
 import pretrained_people
 import pretrained_scenes
+import pretrained_scores
 import pretrained_tables
 import pytest
 import real_pictures
@@ -502,6 +503,7 @@ def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypat
                                                "perspective": (0, 1)})  # fmt: skip
     monkeypatch.setattr(pretrained, "PEOPLE", 1)
     monkeypatch.setattr(pretrained, "REPEATS", 1)
+    monkeypatch.setattr(pretrained_scores, "DRAWS", 50)
     monkeypatch.setattr(pretrained, "run_all", in_this_process)
     where = ["--out", str(made_up), "--results", str(tmp_path)]
     pretrained.main(where)

@@ -12,12 +12,24 @@ namespace {
 
 constexpr int64_t kMostReads = 16;       // along a side of a pixel: all points fit one block
 constexpr double kPerMicrosecond = 500;  // points, or numbers of a frame that are normalized
+constexpr int64_t kShortGap = 8;         // points: to sample them takes less than to skip them
 
-template <typename T>
-std::vector<T> padded(std::span<const T> array) {
-  std::vector<T> values(array.begin(), array.end());
-  values.resize(values.size() + kFrameSpare);
-  return values;
+int64_t length(const std::vector<PixelRun>& runs) {
+  return runs.empty() ? 0 : runs.back().before + runs.back().end - runs.back().begin;
+}
+
+// Adds a pixel to the last run if at most `gap` pixels lie between, in the picture that begins with
+// `first`. Else the pixel begins a run.
+void add(int64_t pixel, int64_t first, int64_t gap, std::vector<PixelRun>& runs) {
+  if (!runs.empty() && runs.back().begin >= first && pixel - runs.back().end <= gap) {
+    runs.back().end = pixel + 1;
+  } else {
+    runs.push_back({pixel, pixel + 1, length(runs)});
+  }
+}
+
+PixelRuns runs_of(const std::vector<PixelRun>& runs) {
+  return {runs.data(), static_cast<int64_t>(runs.size())};
 }
 
 std::string shown(int64_t height, int64_t width) {
@@ -29,10 +41,6 @@ std::string shown(int64_t height, int64_t width) {
 FrameSampler::FrameSampler(const FramePlan& plan)
     : reads(plan.reads >= 1 && plan.reads <= kMostReads ? plan.reads * plan.reads : 0),
       shape(plan.shape.begin(), plan.shape.end() - (plan.reads > 1 && !plan.shape.empty())),
-      columns(padded(plan.columns)),
-      rows(padded(plan.rows)),
-      right(padded(plan.right)),
-      lower(padded(plan.lower)),
       height(plan.height),
       width(plan.width),
       scale(plan.scale),
@@ -53,21 +61,50 @@ FrameSampler::FrameSampler(const FramePlan& plan)
          : plan.output == "image" ? FrameOutput::planes
                                   : FrameOutput::bytes;
   for (size_t k = 0; k < points; ++k) {
-    const float x = right[k], y = lower[k];
+    const float x = plan.right[k], y = plan.lower[k];
     if (!(x >= 0 && x <= 1 && y >= 0 && y <= 1)) {
       throw std::invalid_argument("the plan has distances outside of [0, 1]");
     }
   }
-  for (int64_t first = 0; first < static_cast<int64_t>(points); first += reads) {
-    bool inside = true;
-    for (int64_t k = first; k < first + reads; ++k) {
-      inside &= columns[k] >= 0 && rows[k] >= 0 && columns[k] < width - 1 && rows[k] < height - 1;
-    }
-    for (int64_t k = first; k < first + reads && !inside; ++k) {
-      border.push_back({k, columns[k], rows[k], right[k], lower[k]});
-      columns[k] = rows[k] = 0;
+  const auto is_inside = [&](int64_t k) {
+    const int64_t x = plan.columns[k], y = plan.rows[k];
+    return x >= 0 && y >= 0 && x < width - 1 && y < height - 1;
+  };
+  const auto is_seen = [&](int64_t k) {
+    const int64_t x = plan.columns[k], y = plan.rows[k];
+    return x >= -1 && y >= -1 && x < width && y < height;
+  };
+  pixels = static_cast<int64_t>(points) / reads;
+  picture = !tokens && shape.size() == 3 && shape[0] > 0 ? pixels / shape[0] : pixels;
+  for (int64_t pixel = 0, first = 0; pixel < pixels; ++pixel) {
+    if (pixel - first == picture) first = pixel;
+    const int64_t begin = pixel * reads, end = begin + reads;
+    bool all_inside = true, any_seen = false;
+    for (int64_t k = begin; k < end; ++k) all_inside &= is_inside(k), any_seen |= is_seen(k);
+    any_seen ? add(pixel, first, kShortGap / reads, seen) : add(pixel, first, 0, outside);
+    for (int64_t k = begin; k < end && any_seen && !all_inside; ++k) {
+      border.push_back({pixel, plan.columns[k], plan.rows[k], plan.right[k], plan.lower[k]});
     }
   }
+  const size_t kept = length(seen) * reads + kFrameSpare;
+  columns.resize(kept), rows.resize(kept), right.resize(kept), lower.resize(kept);
+  for (const PixelRun& run : seen) {
+    const int64_t first = run.begin * reads, count = (run.end - run.begin) * reads;
+    const int64_t to = run.before * reads;
+    for (int64_t k = 0; k < count; ++k) {
+      const bool inside = is_inside(first + k);
+      columns[to + k] = inside ? plan.columns[first + k] : 0;
+      rows[to + k] = inside ? plan.rows[first + k] : 0;
+    }
+    std::copy_n(plan.right.begin() + first, count, right.begin() + to);
+    std::copy_n(plan.lower.begin() + first, count, lower.begin() + to);
+  }
+}
+
+int64_t FrameSampler::pixel_after(int64_t count) const {
+  const auto is_behind = [](int64_t count, const PixelRun& run) { return count < run.before; };
+  const auto run = std::upper_bound(seen.begin(), seen.end(), count, is_behind) - 1;
+  return run->begin + count - run->before;
 }
 
 std::vector<int64_t> FrameSampler::output_shape(int64_t channels, bool has_axis) const {
@@ -119,16 +156,20 @@ void FrameSampler::sample(const Frame& frame, void* out) const {
   a.image = image_of(frame, scales, offsets);
   a.columns = columns.data(), a.rows = rows.data();
   a.right = right.data(), a.lower = lower.data();
-  a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
-  const int64_t pictures = kind != FrameOutput::tokens && shape.size() == 3 ? shape[0] : 1;
-  a.reads = reads, a.pixels = a.points / reads / std::max<int64_t>(pictures, 1);
+  a.reads = reads, a.pixels = picture;
+  a.seen = runs_of(seen), a.outside = runs_of(outside);
   a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
   a.output = kind;
   a.out = out;
   const auto& kernel = kernels<FrameKernels>();
-  parallel_ranges(
-      a.points / reads, threads_for(static_cast<double>(a.points) / kPerMicrosecond),
-      [&](int64_t begin, int64_t end) { kernel.sample(a, begin * reads, end * reads); });
+  const int64_t work = length(seen);
+  // Threads share what is seen. The rest hardly takes time.
+  parallel_ranges(std::max<int64_t>(work, 1),
+                  threads_for(static_cast<double>(work * reads) / kPerMicrosecond),
+                  [&](int64_t begin, int64_t end) {
+                    kernel.sample(a, begin > 0 ? pixel_after(begin) : 0,
+                                  end < work ? pixel_after(end) : pixels);
+                  });
 }
 
 void FrameSampler::normalize(const Frame& frame, float* out) const {

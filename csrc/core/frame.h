@@ -52,13 +52,18 @@ class FrameSampler {
   // A checked frame. It keeps pointers to the arrays of 3 numbers.
   ByteImage image_of(const Frame& frame, float* scale, float* offset) const;
 
+  // The pixel of `seen` before which so many others come.
+  int64_t pixel_after(int64_t count) const;
+
   const int64_t reads;
   const std::vector<int64_t> shape;
-  std::vector<int16_t> columns, rows;
-  const std::vector<float> right, lower;
   const int64_t height, width;
   const std::vector<float> scale, offset;
   FrameOutput kind;
+  int64_t pixels, picture;  // of the output: all, and those of one picture
+  std::vector<PixelRun> seen, outside;
+  std::vector<int16_t> columns, rows;  // of the points of `seen`
+  std::vector<float> right, lower;
   std::vector<BorderPoint> border;
 };
 

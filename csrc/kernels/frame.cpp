@@ -4,6 +4,8 @@
 namespace darswin {
 namespace {
 
+constexpr int64_t kPart = 16384;  // pixels that stay in the cache while several loops write to them
+
 // Finds the offsets of points [first, first + count).
 void find_offsets(const FrameArgs& a, int64_t first, int64_t count, int32_t* offset) {
   const auto row_stride = static_cast<int32_t>(a.image.row_stride),
@@ -62,9 +64,24 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlo
   }
 }
 
+// Writes zeros to so many pixels of one picture.
+void write_zeros(const FrameArgs& a, int64_t first, int64_t count) {
+  const int64_t channels = a.image.channels;
+  if (a.output == FrameOutput::planes) {
+    float* plane = static_cast<float*>(a.out) + in_planes(a, first, 0);
+    for (int64_t c = 0; c < channels; ++c) {
+      __builtin_memset(plane + c * a.pixels, 0, static_cast<size_t>(count) * sizeof(float));
+    }
+    return;
+  }
+  const int64_t bytes = channels * (a.output == FrameOutput::bytes ? 1 : sizeof(float));
+  __builtin_memset(static_cast<uint8_t*>(a.out) + first * bytes, 0,
+                   static_cast<size_t>(count * bytes));
+}
+
 // Writes the pixel whose points begin at this one of `border`.
 void write_border(const FrameArgs& a, const BorderPoint* points) {
-  const int64_t channels = a.image.channels, k = points->index / a.reads;
+  const int64_t channels = a.image.channels, k = points->pixel;
   for (int64_t c = 0; c < channels; ++c) {
     float v = 0;
     for (int64_t r = 0; r < a.reads; ++r) {
@@ -82,26 +99,60 @@ void write_border(const FrameArgs& a, const BorderPoint* points) {
   }
 }
 
+// The first of so many items for which the condition holds. It holds for all items after that.
+template <typename Item, typename Condition>
+const Item* first_of(const Item* items, int64_t count, Condition condition) {
+  int64_t low = 0;
+  while (low < count) {
+    const int64_t middle = (low + count) / 2;
+    condition(items[middle]) ? count = middle : low = middle + 1;
+  }
+  return items + low;
+}
+
+// Calls body(pixel, last, before) for the parts [pixel, last) of runs that are in [begin, end),
+// with so many pixels of the runs before.
+template <typename Body>
+void for_runs(const PixelRuns& all, int64_t begin, int64_t end, Body body) {
+  const PixelRun* last = all.runs + all.count;
+  const auto reaches = [&](const PixelRun& run) { return run.end > begin; };
+  for (const PixelRun* run = first_of(all.runs, all.count, reaches); run < last && run->begin < end;
+       ++run) {
+    const int64_t first = run->begin > begin ? run->begin : begin;
+    body(first, smaller(run->end, end), run->before + first - run->begin);
+  }
+}
+
+// Samples pixels [begin, end). What lies outside in short gaps is sampled first, and then zero.
+void sample_part(const FrameArgs& a, int64_t begin, int64_t end, ByteBlock& block) {
+  const int64_t most = kByteBlock / a.reads;
+  const auto sample_run = [&](int64_t pixel, int64_t last, int64_t before) {
+    for (int64_t count; pixel < last; pixel += count, before += count) {
+      count = smaller(most, last - pixel);
+      const int64_t first = before * a.reads;
+      find_offsets(a, first, count * a.reads, block.offset);
+      block.sample(a.image, a.right + first, a.lower + first, count * a.reads);
+      if (a.reads > 1) average(a, count, block);
+      write_block(a, pixel, count, block);
+    }
+  };
+  // A frame of one row or column has no four neighbours: all that it shows are border points.
+  if (a.image.height > 1 && a.image.width > 1) for_runs(a.seen, begin, end, sample_run);
+  for_runs(a.outside, begin, end,
+           [&](int64_t pixel, int64_t last, int64_t) { write_zeros(a, pixel, last - pixel); });
+  const BorderPoint* last = a.border + a.border_points;
+  const auto is_in = [&](const BorderPoint& point) { return point.pixel >= begin; };
+  for (const BorderPoint* point = first_of(a.border, a.border_points, is_in);
+       point < last && point->pixel < end; point += a.reads) {
+    write_border(a, point);
+  }
+}
+
 void sample(const FrameArgs& a, int64_t begin, int64_t end) {
   alignas(64) ByteBlock block;
-  // A frame of one row or column has no four neighbours: all its points are border points.
-  const bool neighbours = a.image.height > 1 && a.image.width > 1;
-  const int64_t most = kByteBlock / a.reads, last = end / a.reads;
-  for (int64_t pixel = begin / a.reads, count; pixel < last && neighbours; pixel += count) {
-    count = smaller(smaller(most, last - pixel), a.pixels - pixel % a.pixels);
-    const int64_t first = pixel * a.reads;
-    find_offsets(a, first, count * a.reads, block.offset);
-    block.sample(a.image, a.right + first, a.lower + first, count * a.reads);
-    if (a.reads > 1) average(a, count, block);
-    write_block(a, pixel, count, block);
-  }
-  int64_t low = 0, high = a.border_points;  // finds the first border point from `begin` on
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    a.border[middle].index < begin ? low = middle + 1 : high = middle;
-  }
-  for (; low < a.border_points && a.border[low].index < end; low += a.reads) {
-    write_border(a, a.border + low);
+  for (int64_t next; begin < end; begin = next) {
+    next = smaller(begin + kPart, end);
+    sample_part(a, begin, next, block);
   }
 }
 

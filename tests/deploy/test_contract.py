@@ -87,7 +87,8 @@ def made(family, channels=3, **options):
         layers = nn.Conv2d(channels, 4, 3, padding=1), nn.GELU(), nn.Conv2d(4, 5, 2, 2)
         network: nn.Module = nn.Sequential(*layers)
     else:
-        network = model_of(name, channels, **dict(rays=False) if name == "conv_unet" else {})
+        own = dict(rays=False) if name == "conv_unet" else options.get("options", {})
+        network = model_of(name, channels, **own)
     given = dict(zip(("mean", "std"), (MEAN, STD) if channels == 3 else (0.4, 0.2), strict=True))
     output = options.get("output", "pixels")
     return LensAdapter(network, view=make_view(view, size, **given), output=output).eval()
@@ -245,6 +246,15 @@ def test_an_optimized_model_leaves_the_threads_of_torch_asleep(name):
     assert computed.names == []
 
 
+# Each block of a graph takes seconds. These have a shifted window, and a block after a merge.
+SHORT = dict(depths=(2, 1), num_heads=(1, 2))
+SHORTER = dict.fromkeys([*CLASSIFIERS, *UNETS], SHORT) | {
+    "dat": dict(SHORT, blocks=("LD", "D"), groups=(1, 1)),
+    "adapter": dict(options=SHORT),
+    "conv_unet": {},
+}
+
+
 @pytest.mark.slow
 @pytest.mark.unsanitized
 @torch.no_grad()
@@ -256,7 +266,8 @@ def test_an_optimized_model_leaves_the_threads_of_torch_asleep(name):
 )  # fmt: skip
 def test_graphs_from_frames_and_from_tokens_are_the_same(case, tmp_path):
     runtime = pytest.importorskip("onnxruntime")
-    model = made(case[0], **case[1])
+    family, options = case
+    model = made(family, **options, **SHORTER[family])
     size = size_of(model)
     frame = torch.from_numpy(random_frame(*size, 3))[None]
     expected = model(frame, ROUND)
