@@ -89,11 +89,11 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Says whether 8-bit layers may use the CPU's products of four bytes, as they do at first. The
-// results are the same. Returns true if they use them now.
-FACT bool darswin_allow_fours(bool allowed) {
-  darswin::allow_fours(allowed);
-  return darswin::has_fours();
+// Limits the way of 8-bit products: 0 pairs, 1 fours, 2 tiles, the limit at first. The results are
+// the same. Returns the way in use now.
+FACT int darswin_limit_byte_products(int most) {
+  darswin::limit_byte_products(static_cast<darswin::ByteProducts>(most));
+  return static_cast<int>(darswin::byte_products());
 }
 
 // Says whether calls of this thread use the threads of torch, as the backwards do by themselves.

@@ -28,11 +28,16 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
   } else {
     args.out = static_cast<float*>(out);
   }
+  constexpr int64_t kRows = 16;  // ranges begin at a multiple: no tile of rows is cut
   const auto& table = kernels<LinearKernels<X>>();
-  const bool by_fours = table.by_fours != nullptr && has_fours();
-  const auto kernel = by_fours ? table.by_fours : table.rows;
-  constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
-  const double per_microsecond = by_fours ? 1e5 : 5e4;  // multiply-adds
+  const auto [kernel, per_microsecond] = [&]() -> std::pair<decltype(table.rows), double> {
+    if constexpr (std::is_same_v<X, uint8_t>) {
+      const ByteProducts best = byte_products();
+      if (best == ByteProducts::tiles && rows >= kRows) return {table.by_tiles, 4e5};
+      if (best != ByteProducts::pairs && table.by_fours) return {table.by_fours, 1e5};
+    }
+    return {table.rows, 5e4};  // multiply-adds
+  }();
   const double work = static_cast<double>(rows) * depth * columns;
   const Threads threads = threads_for(work / per_microsecond);
   const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
