@@ -95,8 +95,9 @@ ByteProducts byte_products() {
   using enum ByteProducts;
   const auto best = [](Tier tier) { return cpu_has_fours(tier) ? fours : pairs; };
   static const auto avx512 = has_tiles() ? tiles : best(Tier::avx512), others = best(Tier::avx2);
-  return std::min(current_tier() == Tier::avx512 ? avx512 : others,
-                  most.load(std::memory_order_relaxed));
+  const Tier tier = current_tier();
+  const auto found = tier == Tier::avx512 ? avx512 : tier == Tier::generic ? pairs : others;
+  return std::min(found, most.load(std::memory_order_relaxed));
 }
 
 void limit_byte_products(ByteProducts limit) { most.store(limit, std::memory_order_relaxed); }

@@ -41,7 +41,7 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
     const ByteProducts best = byte_products();
     if (best == ByteProducts::tiles && rows >= kRows && depth >= kTileDepth) {
       kernel = table.by_tiles, per_microsecond = 4e5;
-    } else if (best != ByteProducts::pairs) {
+    } else if (best != ByteProducts::pairs && table.by_fours != nullptr) {
       kernel = table.by_fours, per_microsecond = 1e5;
     }
   }

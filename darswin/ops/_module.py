@@ -87,14 +87,14 @@ def set_tier(tier: str) -> None:
 BYTE_PRODUCTS = ("pairs", "fours", "tiles")  # from slow to fast
 
 
-def limit_byte_products(most: str) -> str:
-    """Limits how 8-bit layers multiply, and returns how they do it now. The results are the same.
+def byte_products(most: str | None = None) -> str:
+    """How 8-bit layers multiply, after an optional limit. The results are the same.
 
-    "pairs": as numbers of 16 bits. "fours": by an instruction for four bytes, such as VNNI. "tiles":
-    by AMX, the limit at first. The CPU, the system and the tier may lack the last two.
+    "pairs": as numbers of 16 bits. "fours": by an instruction for four bytes, such as VNNI.
+    "tiles": by AMX, the limit at first. The CPU, the system and the tier may lack the last two.
     """
-    limit = BYTE_PRODUCTS.index(most)
-    return BYTE_PRODUCTS[0 if _loaded is None else _loaded.darswin_limit_byte_products(limit)]
+    limit = -1 if most is None else BYTE_PRODUCTS.index(most)
+    return BYTE_PRODUCTS[0 if _loaded is None else _loaded.darswin_byte_products(limit)]
 
 
 def torch_threads_switch() -> Callable[[bool], None]:
