@@ -35,9 +35,9 @@ from darswin.deploy.camera import export_network
 from darswin.deploy.camera import plan as plan_of
 from darswin.deploy.export import export_onnx, export_package
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.linear import onednn_lack
 from darswin.lens import Lens
 from darswin.models.base import Model
+from darswin.ops import _module
 
 Run = Callable[[Tensor], Tensor]
 EAGER, ANY_LENS = "eager model", "optimize, any lens"
@@ -86,7 +86,7 @@ def exported(folder: Path, kind: str, name: str, size: int, model: Model) -> str
         images, lens = torch.randn(1, 3, size, size), lens_of(size)
         start = time.perf_counter()
         if kind == "onnx":
-            has_vnni = onednn_lack(torch.int8) is None  # a file for VNNI is wrong elsewhere
+            has_vnni = _module.byte_products() != "pairs"  # a file for VNNI is wrong elsewhere
             export_onnx(model, path, images, lens, fixed_lens=True, vnni_only=has_vnni)
         else:
             export_package(model, path, images, lens, fixed_lens=True)

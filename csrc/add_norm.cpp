@@ -1,4 +1,4 @@
-// _add_norm_ and _add_norm_quantized_ on CPU: check, thread, call the kernel.
+// _add_norm_ on CPU: check, thread, call the kernel.
 #include "add_norm.h"
 
 #include <algorithm>
@@ -67,25 +67,9 @@ void add_norm_(Tensor x, Tensor y, Tensor weight, Tensor bias, double eps) {
   run(AddNormArgs<float, float>{.y = out, .out = out}, x, weight, bias, eps);
 }
 
-Tensor add_norm_quantized_(Tensor x, MaybeTensor y, Tensor weight, Tensor bias, double eps,
-                           double scale, int64_t zero_point) {
-  STD_TORCH_CHECK(
-      x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.is_contiguous(),
-      "add_norm_quantized_: x must be float32 and contiguous");
-  if (y) check_alike(x, *y);
-  check_parameters(x, weight, bias);
-  const Tensor out = new_tensor(x.sizes(), ScalarType::Byte);
-  run(AddNormArgs<float, uint8_t>{.y = y ? pointer<float>(*y) : nullptr,
-                                  .out = mutable_pointer<uint8_t>(out),
-                                  .quantizer = quantizer(scale, zero_point)},
-      x, weight, bias, eps);
-  return out;
-}
-
 }  // namespace
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
   m.impl("_add_norm_", TORCH_BOX(&darswin::add_norm_));
-  m.impl("_add_norm_quantized_", TORCH_BOX(&darswin::add_norm_quantized_));
 }

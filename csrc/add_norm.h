@@ -1,4 +1,4 @@
-// The interface between the drivers of _add_norm_ and _add_norm_quantized_ and their kernels.
+// The interface between the drivers of norms and their kernels.
 #pragma once
 
 #include <cstdint>

@@ -38,12 +38,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def("_add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
   m.def(
-      "_add_norm_quantized_(Tensor(a!) x, Tensor? y, Tensor weight, Tensor bias, float eps, "
-      "float scale, int zero_point) -> Tensor");
-  m.def(
-      "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
-      "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
-  m.def(
       "_pack_linear(Tensor weight, Tensor? bias, Tensor? weight_scale=None, float scale=1.0, "
       "int zero_point=0) -> Tensor");
   m.def("_norm(Tensor x, Tensor parameters, float eps) -> Tensor");
@@ -89,11 +83,11 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Says whether 8-bit layers may use the CPU's products of four bytes, as they do at first. The
-// results are the same. Returns true if they use them now.
-FACT bool darswin_allow_fours(bool allowed) {
-  darswin::allow_fours(allowed);
-  return darswin::has_fours();
+// Returns the way of 8-bit products: 0 pairs, 1 fours, 2 tiles. `most` limits it first, unless it is
+// negative. The results are the same.
+FACT int darswin_byte_products(int most) {
+  if (most >= 0) darswin::limit_byte_products(static_cast<darswin::ByteProducts>(most));
+  return static_cast<int>(darswin::byte_products());
 }
 
 // Says whether calls of this thread use the threads of torch, as the backwards do by themselves.

@@ -71,7 +71,8 @@ struct LinearKernels {
   // Computes the columns of panels [first, last) of rows [begin, end).
   using Rows = void(const LinearArgs<X>&, int64_t begin, int64_t end, int64_t first, int64_t last);
   Rows* rows;
-  Rows* by_fours;  // the same with the CPU's products of four bytes; null on tiers without any
+  // The same with the CPU's products of four bytes, or with AMX; null on tiers without any.
+  Rows *by_fours, *by_tiles;
 };
 
 }  // namespace darswin

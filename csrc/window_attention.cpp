@@ -7,20 +7,13 @@
 namespace darswin {
 namespace {
 
-// Returns the output. With a quantizer, which only float has, it returns the output as 8 bits.
 template <typename T>
-Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
+Tensor forward(AttentionCall<T>&& call) {
   auto& args = call.args;
-  const ScalarType type = quantizer == nullptr ? call.qkv.scalar_type() : ScalarType::Byte;
-  const Tensor out = new_tensor(call.output_sizes(), type);
+  const Tensor out = new_tensor(call.output_sizes(), call.qkv.scalar_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
-  if (quantizer == nullptr) {
-    args.out = mutable_pointer<T>(out);
-  } else {
-    args.quantized = mutable_pointer<uint8_t>(out);
-    args.quantizer = *quantizer;
-  }
+  args.out = mutable_pointer<T>(out);
   call.run(args.windows * args.heads, 2, kernels<WindowAttentionKernels<T>>().forward);
   return out;
 }
@@ -65,15 +58,6 @@ Tensor window_attention(Tensor qkv, Tensor bias, Sizes window, Sizes shift, Size
   });
 }
 
-Tensor window_attention_quantized(Tensor qkv, Tensor bias, Sizes window, Sizes shift,
-                                  Sizes periodic, double scale, double out_scale,
-                                  int64_t zero_point) {
-  STD_TORCH_CHECK(qkv.is_cpu() && qkv.scalar_type() == ScalarType::Float, kAttention,
-                  "_quantized: qkv must be float32");
-  const Quantizer to_bytes = quantizer(out_scale, zero_point);
-  return forward(AttentionCall<float>(qkv, bias, window, shift, periodic, scale), &to_bytes);
-}
-
 auto window_attention_backward(Tensor qkv, Tensor bias, Sizes window, Sizes shift, Sizes periodic,
                                double scale, Tensor grad_out) {
   return with_real_type(qkv, kAttention, [&]<typename T>() {
@@ -86,6 +70,5 @@ auto window_attention_backward(Tensor qkv, Tensor bias, Sizes window, Sizes shif
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
   m.impl("window_attention", TORCH_BOX(&darswin::window_attention));
-  m.impl("_window_attention_quantized", TORCH_BOX(&darswin::window_attention_quantized));
   m.impl("window_attention_backward", TORCH_BOX(&darswin::window_attention_backward));
 }

@@ -210,7 +210,7 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
 
 
 def test_the_modules_export_no_more_than_needed():
-    facts = {"tier", "tiers", "set_tier", "build_info", "allow_fours", "use_torch_threads"}
+    facts = {"tier", "tiers", "set_tier", "build_info", "byte_products", "use_torch_threads"}
     for path, names in [
         (_module.FILE, {f"darswin_{fact}" for fact in facts}),
         (FRAMES, {"PyInit__frames"}),

@@ -24,7 +24,6 @@ from torch import nn
 from darswin import create_model, frames, optimize
 from darswin.compat import OfficialDarSwin
 from darswin.deploy import camera
-from darswin.deploy.optimize import optimized
 from darswin.lens import Equidistant
 from darswin.models import Encoder, LensAdapter
 from darswin.views import PolarView
@@ -250,7 +249,7 @@ def test_frames_are_read_without_torch_in_little_memory_on_every_tier(tier, tmp_
     environment = os.environ | {"ATEN_CPU_CAPABILITY": tier}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert_close([np.load(tmp_path / "found.npy")], by_model(model, frame))
-    expected = by_model(optimized(small, torch.int8, own_alone=True), frame[:70, :80])
+    expected = by_model(optimize(small, torch.int8), frame[:70, :80])
     assert_close([np.load(tmp_path / "quantized.npy")], expected, 0.05)
     sampled = sampling(torch.from_numpy(frame[:70, :80])[None], ROUND)
     np.testing.assert_allclose(np.load(tmp_path / "tokens.npy"), sampled[0], atol=1e-5)

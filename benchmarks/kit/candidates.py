@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import Libraries, OneDNN, Own, best_seconds, onednn_linear
+from darswin.deploy.packed import Own, best_seconds, library_of, onednn_linear
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
@@ -129,16 +129,15 @@ def matmuls_of(
 
 def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], Tensor]]:
     """One linear layer by each library that computes it, in `dtype` or as it is quantized."""
-    libraries: dict[str, Callable[[Tensor], Tensor]]
     if isinstance(layer, QuantizedLinear):
-        libraries = {"darswin": Own().linear(layer)}
-        if onednn_lack(torch.int8) is None:
-            libraries["onednn"] = OneDNN(dtype).linear(layer)
-        return libraries
+        return {"darswin": Own().linear(layer)}
     weight = layer.weight.detach().to(dtype)
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)
-    ours = Libraries(dtype).of(layer).linear(layer)
-    libraries = {"darswin": ours, "torch": lambda x: F.linear(x, weight, bias)}
+    ours = library_of(dtype).linear(layer)
+    libraries: dict[str, Callable[[Tensor], Tensor]] = {
+        "darswin": ours,
+        "torch": lambda x: F.linear(x, weight, bias),
+    }
     if onednn_lack(dtype) is None:
         libraries["onednn"] = onednn_linear(weight, bias)
     return libraries

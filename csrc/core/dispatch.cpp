@@ -7,7 +7,12 @@
 #elif defined(__aarch64__) && defined(__linux__)
 #  include <sys/auxv.h>
 #endif
+#if defined(__linux__)
+#  include <sys/syscall.h>
+#  include <unistd.h>
+#endif
 
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
 #include <cstring>
@@ -47,7 +52,7 @@ Tier initial() {
 }
 
 std::atomic<Tier> current{initial()};
-std::atomic<bool> fours{true};
+std::atomic<ByteProducts> most{ByteProducts::tiles};
 
 bool cpu_has_fours([[maybe_unused]] Tier tier) {
 #if defined(__x86_64__)
@@ -63,6 +68,19 @@ bool cpu_has_fours([[maybe_unused]] Tier tier) {
 #endif
 }
 
+// The registers are large, so a process has them only after it has asked for them.
+bool has_tiles() {
+#if defined(__x86_64__) && defined(__linux__)
+  constexpr unsigned kAmx = 1 << 24 | 1 << 25;          // the tiles, and their products of bytes
+  constexpr int kRequest = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (d & kAmx) == kAmx &&
+         syscall(SYS_arch_prctl, kRequest, kTileData) == 0;
+#else
+  return false;
+#endif
+}
+
 }  // namespace
 
 bool cpu_is_intel() {
@@ -73,13 +91,16 @@ bool cpu_is_intel() {
 #endif
 }
 
-bool has_fours() {
-  static const bool avx512 = cpu_has_fours(Tier::avx512), others = cpu_has_fours(Tier::avx2);
-  return fours.load(std::memory_order_relaxed) &&
-         (current_tier() == Tier::avx512 ? avx512 : others);
+ByteProducts byte_products() {
+  using enum ByteProducts;
+  const auto best = [](Tier tier) { return cpu_has_fours(tier) ? fours : pairs; };
+  static const auto avx512 = has_tiles() ? tiles : best(Tier::avx512), others = best(Tier::avx2);
+  const Tier tier = current_tier();
+  const auto found = tier == Tier::avx512 ? avx512 : tier == Tier::generic ? pairs : others;
+  return std::min(found, most.load(std::memory_order_relaxed));
 }
 
-void allow_fours(bool allowed) { fours.store(allowed, std::memory_order_relaxed); }
+void limit_byte_products(ByteProducts limit) { most.store(limit, std::memory_order_relaxed); }
 
 Tier current_tier() { return current.load(std::memory_order_relaxed); }
 

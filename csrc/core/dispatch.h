@@ -17,10 +17,13 @@ bool set_tier(const char* name);      // false if the CPU or the build lacks tha
 
 bool cpu_is_intel();
 
-// Returns true if this CPU has the tier's instruction for the products of four bytes, unless
-// allow_fours(false) was called.
-bool has_fours();
-void allow_fours(bool allowed);
+// How to multiply bytes: as pairs of 16 bits, by the tier's instruction for the products of four, or
+// by the tiles of AMX. The results are the same.
+enum class ByteProducts { pairs, fours, tiles };
+
+// The best way that this CPU, the tier and the limit have. The first call asks Linux for the tiles.
+ByteProducts byte_products();
+void limit_byte_products(ByteProducts most);
 
 template <typename Table, Tier... tiers>
 const Table* find_table(Tier tier) {

@@ -26,9 +26,11 @@ inline V write(S* to, V v) {
   return v;
 }
 
-// Calls body<V>(column, turn) for each whole register of a row, then for each remaining column. The
-// turns alternate between 0 and 1. With one sum for each turn, an addition does not wait for the
-// one before.
+using Half = Vector<float, kL / 2>;
+
+// Calls body<V>(column, turn) for each whole register of a row, then for half a register, and then
+// for each remaining column. The turns alternate between 0 and 1. With one sum for each turn, an
+// addition does not wait for the one before.
 template <typename Body>
 inline void along(int64_t width, Body body) {
   int64_t c = 0;
@@ -37,6 +39,9 @@ inline void along(int64_t width, Body body) {
     body.template operator()<Floats>(c + kL, 1);
   }
   for (; c + kL <= width; c += kL) body.template operator()<Floats>(c, 0);
+  if constexpr (kL > 4) {
+    for (; c + kL / 2 <= width; c += kL / 2) body.template operator()<Half>(c, 0);
+  }
   for (; c < width; ++c) body.template operator()<float>(c, 0);
 }
 
@@ -59,6 +64,7 @@ struct Sum {
   Floats lanes[2]{};
   float rest = 0;
   void add(Floats v, int turn) { lanes[turn] += v; }
+  void add(Half v, int) { rest += total<kL / 2>(v); }
   void add(float v, int) { rest += v; }
   float all() const { return total<kL>(lanes[0] + lanes[1]) + rest; }
 };

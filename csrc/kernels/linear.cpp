@@ -12,8 +12,9 @@
 // With 8 bits, a number of a token is a word of four depths, if the CPU adds the products of four
 // bytes in one instruction. Other CPUs add the products of two numbers of 16 bits. For them, a word
 // is split into two words of two depths: those of a part of the weights once for all tokens, and
-// those of a few tokens once for all columns of a panel. Either way the sums are integers and
-// exact, so the results are the same.
+// those of a few tokens once for all columns of a panel. With AMX, a tile of sums has 16 tokens, and
+// an instruction adds the products of 16 words of each. Every way the sums are integers and exact,
+// so the results are the same.
 #include "../linear.h"
 
 #include "activations.h"
@@ -24,17 +25,18 @@ namespace {
 
 constexpr int64_t kL = kLanes<float>;
 constexpr int64_t kPart = 128;  // words of a token in a tile; this part of a panel has 24 KB
+constexpr int64_t kTile = 16;   // tokens and words of a tile of AMX
 constexpr int64_t kMostRows = 128, kBlockBytes = 3 << 17;  // of a block of tokens
 
 // The kinds of products. X is the type of a token's numbers, Word that of a word in a tile, and Sum
 // that of a sum. A word of the layer becomes kSplit words in a tile. If kCopies, a tile reads a
-// copy of its tokens.
+// copy of its tokens. If kStarts, the sums do not start at zero. If kInTiles, AMX has the tiles.
 struct Numbers {
   using X = float;
   using Word = float;
   using Sum = float;
   static constexpr int64_t kSplit = 1;
-  static constexpr bool kCopies = false;
+  static constexpr bool kCopies = false, kStarts = false, kInTiles = false;
   static Floats add(Floats sums, Floats x, Floats weights) { return sums + x * weights; }
 };
 
@@ -42,12 +44,13 @@ struct Bytes {
   using X = uint8_t;
   using Word = uint32_t;
   using Sum = int32_t;
+  static constexpr bool kStarts = false, kInTiles = false;
 };
 
 // Four bytes in a word. If the CPU's bytes are signed, the copy of a token is 128 less.
 struct Fours : Bytes {
   [[maybe_unused]] static constexpr int64_t kSplit = 1;
-  [[maybe_unused]] static constexpr bool kCopies = kSignedFours;
+  [[maybe_unused]] static constexpr bool kCopies = kSignedFours, kStarts = kSignedFours;
   template <typename S, typename W>
   static S add(S sums, W x, W weights) {
     return add_fours(sums, x, weights);
@@ -83,6 +86,13 @@ struct Pairs : Bytes {
     for (; k + 4 <= words; k += 4) some.template operator()<4>(k);
     for (; k < words; ++k) some.template operator()<1>(k);
   }
+};
+
+// The same in tiles of AMX, which only some tiers have.
+struct AmxTiles;
+struct Tiles : Fours {
+  [[maybe_unused]] static constexpr bool kInTiles = true;
+  using Amx = AmxTiles;
 };
 
 inline float word(const float* token, int64_t k) { return token[k]; }
@@ -130,7 +140,7 @@ struct Panel {
                               int64_t n, Sums* so_far) const {
     const Word* w = part.weight + n;
     Sums sum[kRows][kWide] = {};
-    if constexpr (is_same_v<P, Fours> && kSignedFours) {
+    if constexpr (P::kStarts) {
       each_register<kRows, kWide>([&](int i, int v) { sum[i][v] = part.start[n / kL + v]; });
     }
     for (int64_t k = 0; k < part.words; ++k) {
@@ -150,6 +160,13 @@ struct Panel {
       each_register<kRows, kWide>([&](int i, int v) { earlier(i, v) = sum[i][v]; });
       return;
     }
+    write(sum, row, n);
+  }
+
+  // Writes the results of the sums of a tile.
+  template <int kRows, int kWide>
+  [[gnu::always_inline]] inline void write(const Sums (&sum)[kRows][kWide], int64_t row,
+                                           int64_t n) const {
     Floats result[kRows][kWide];
     each_register<kRows, kWide>(
         [&](int i, int v) { result[i][v] = value(sum[i][v], first + n + v * kL); });
@@ -219,6 +236,25 @@ struct Panel {
     }
   }
 
+  // Computes the columns of a tile of tokens, or of fewer at the end, with all sums in memory.
+  template <int kWide>
+  void wide_tile(const Part& part, int64_t row, int64_t count, Sums* so_far) const {
+    P::Amx::template multiply<kWide>(a.x + row * a.depth + part.begin * kDepths<X>, a.depth,
+                                     part.weight, width, part.words, so_far, kPanel * sizeof(Word),
+                                     part.begin == 0);
+    if (part.end < words) return;
+    int64_t i = 0;
+    for (; i + kTileRows <= count; i += kTileRows) written<kTileRows, kWide>(row + i, so_far, i);
+    for (; i < count; ++i) written<1, kWide>(row + i, so_far, i);
+  }
+  template <int kRows, int kWide>
+  [[gnu::noinline]] void written(int64_t row, const Sums* so_far, int64_t first) const {
+    Sums sum[kRows][kWide];
+    each_register<kRows, kWide>(
+        [&](int i, int v) { sum[i][v] = so_far[(first + i) * kPanel / kL + v]; });
+    write(sum, row, 0);
+  }
+
   template <int kRows>
   void columns(const Part& part, int64_t row, Sums* so_far) const {
     const X* token = a.x + row * a.depth + part.begin * kDepths<X>;
@@ -254,9 +290,22 @@ struct Panel {
         for (int64_t k = 0; k < count * width; k += 64 / sizeof(Word)) fetch(next + k);
         part.weight = split;
       }
-      if constexpr (is_same_v<P, Fours> && kSignedFours) add_128(part);
+      if constexpr (P::kStarts) add_128(part);
       const auto so_far = [&](int64_t row) { return sums + (row - first_row) * kPanel / kL; };
       int64_t row = first_row;
+      if constexpr (P::kInTiles) {
+        const bool whole = words <= kStep;  // then the sums of one tile are enough
+        for (; row < last_row; row += kTile) {
+          const int64_t count = smaller(kTile, last_row - row);
+          if (count < kTile) P::Amx::shape(count, words % kTile);
+          Sums* const to = so_far(whole ? first_row : row);
+          if (width == 3 * kTile) wide_tile<3>(part, row, count, to);
+          if (width == 2 * kTile) wide_tile<2>(part, row, count, to);
+          if (width == kTile) wide_tile<1>(part, row, count, to);
+          if (count < kTile) P::Amx::shape(kTile, words % kTile);
+        }
+        continue;
+      }
       for (; row + kTileRows <= last_row; row += kTileRows) {
         columns<kTileRows>(part, row, so_far(row));
       }
@@ -288,6 +337,7 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
   const int64_t most = smaller(kMostRows, round_up(1 + fitting, kTileRows));
   const int64_t padded = padded_columns(a.columns), words = depth_words<X>(a.depth);
   const auto* weight = static_cast<const Word*>(a.packed) + kParameters<X> * padded;
+  if constexpr (P::kInTiles) P::Amx::shape(kTile, words % kTile);
   for (int64_t row = begin; row < end; row += most) {
     for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded);
          column += kPanel) {
@@ -296,11 +346,12 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
       panel.rows(row, smaller(row + most, end));
     }
   }
+  if constexpr (P::kInTiles) P::Amx::release();
 }
 
-template <typename P>
+template <typename P, bool kIsThere>
 constexpr auto if_there() -> decltype(&linear_rows<P>) {
-  if constexpr (kHasFours) {
+  if constexpr (kIsThere) {
     return linear_rows<P>;
   } else {
     return nullptr;
@@ -309,7 +360,10 @@ constexpr auto if_there() -> decltype(&linear_rows<P>) {
 
 }  // namespace
 
-TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<Numbers>, .by_fours = nullptr};
-TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<Pairs>, .by_fours = if_there<Fours>()};
+TIER_TABLE(LinearKernels<float>) = {
+    .rows = linear_rows<Numbers>, .by_fours = nullptr, .by_tiles = nullptr};
+TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<Pairs>,
+                                      .by_fours = if_there<Fours, kHasFours>(),
+                                      .by_tiles = if_there<Tiles, kHasTiles>()};
 
 }  // namespace darswin

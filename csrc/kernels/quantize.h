@@ -1,4 +1,4 @@
-// Rounds numbers to 8 bits, in the form that oneDNN's integer products read.
+// Rounds numbers to 8 bits, as integer products read them.
 //
 // After adding 1.5 * 2^23, a float has no bits left for a fraction. So the sum is rounded to the
 // nearest integer, ties to even, and this integer is in the lowest bits. Values out of range are
@@ -10,7 +10,7 @@
 namespace darswin {
 namespace {
 
-// Works on one float or on a register, Floats.
+// Works on one float, on a register, Floats, or on a part of one.
 class Quantize {
  public:
   explicit Quantize(Quantizer q)
@@ -28,8 +28,10 @@ class Quantize {
     const auto bits = __builtin_bit_cast(BitsOf<V>, value + kShift) + zero_point;
     if constexpr (is_same_v<V, float>) {
       *to = static_cast<uint8_t>(bits);
-    } else {
+    } else if constexpr (is_same_v<V, Floats>) {
       store_lowest_bytes(to, bits);
+    } else {
+      store_bits(to, __builtin_convertvector(bits, Vector<uint8_t, sizeof(V) / sizeof(float)>));
     }
   }
   void operator()(uint8_t* to, const float* from, int64_t count) const {

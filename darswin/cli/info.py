@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import fastest_dtype, has_own_int8
+from darswin.deploy.packed import fastest_dtype
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.models import create_model, list_models
@@ -18,6 +18,9 @@ from darswin.models.saving import load_model, read_card
 from darswin.ops import _module, cpu_capability
 from darswin.utils import extras
 
+BYTE_PRODUCTS = {
+    "pairs": "as numbers of 16 bits", "fours": "by VNNI or dot products", "tiles": "by AMX",
+}  # fmt: skip
 EXTRAS = ("demo", "onnx", "train")
 
 
@@ -74,7 +77,7 @@ def facts() -> dict[str, str]:
         reason = onednn_lack(dtype)
         lines[_name(dtype)] = "oneDNN" if reason is None else f"torch: {reason}"
     if lack is None:
-        lines["int8"] = "darswin" if has_own_int8() else "oneDNN"
+        lines["int8"] = f"darswin, {BYTE_PRODUCTS[_module.byte_products()]}"
         lines["fastest"] = f"int8 for quantized models, else {_name(fastest_dtype())}"
     for extra in EXTRAS:
         lines[f"[{extra}]"] = extras.lack(extra) or "installed"

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from darswin.deploy.networks import frame_program
-from darswin.deploy.optimize import check_model, optimized
+from darswin.deploy.optimize import check_model, optimize
 from darswin.deploy.program import NoProgramError
 from darswin.frames.plans import Output, Plan, check_output, check_size
 from darswin.frames.tensor_file import check_name, write_tensors
@@ -116,7 +116,7 @@ def export_network(
     try:
         with torch.no_grad():
             dtype = torch.int8 if quantized_layers(model) else torch.float32
-            fast = optimized(model, dtype, own_alone=True)
+            fast = optimize(model, dtype)
             program = frame_program(fast, lens, size)
     except NoProgramError as error:
         raise TypeError(

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from darswin.deploy.own import OwnLinear, OwnNorm, pack
-from darswin.deploy.packed import InDtype, Layer, Libraries, Own, OwnBlocks, refuse_gradients
+from darswin.deploy.packed import InDtype, Layer, Own, OwnBlocks, refuse_gradients
 from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
@@ -24,18 +24,18 @@ CACHED_BYTES = 16 * 2**20
 
 
 @singledispatch
-def fast(layer: nn.Module, libraries: Libraries) -> nn.Module:
+def fast(layer: nn.Module, library: Own) -> nn.Module:
     """The layer that takes the place of another one. A kind of layer that is not registered here
     stays, with fast layers in it."""
     for name, part in layer.named_children():
-        layer.add_module(name, fast(part, libraries))
+        layer.add_module(name, fast(part, library))
     return layer
 
 
 @fast.register
-def _(unet: Unet, libraries: Libraries) -> nn.Module:
+def _(unet: Unet, library: Own) -> nn.Module:
     for part in (unet.encoder, unet.decoder, unet.head):  # the places of tokens stay in float32
-        fast(part, libraries)
+        fast(part, library)
     return unet
 
 
@@ -51,29 +51,29 @@ class FastLayer(nn.Module):
 
 
 @fast.register
-def _(linear: nn.Linear, libraries: Libraries) -> nn.Module:
-    return FastLayer(libraries.of(linear).linear(linear))
+def _(linear: nn.Linear, library: Own) -> nn.Module:
+    return FastLayer(library.linear(linear))
 
 
 @fast.register
-def _(layer: QuantizedLinear, libraries: Libraries) -> nn.Module:
+def _(layer: QuantizedLinear, library: Own) -> nn.Module:
     raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
 
 
 @fast.register
-def _(norm: nn.LayerNorm, libraries: Libraries) -> nn.Module:
-    return FastLayer(libraries.of(norm).norm(norm))
+def _(norm: nn.LayerNorm, library: Own) -> nn.Module:
+    return FastLayer(library.norm(norm))
 
 
 @fast.register
-def _(conv: nn.Conv2d, libraries: Libraries) -> nn.Module:
-    return InDtype(conv, libraries.dtype)
+def _(conv: nn.Conv2d, library: Own) -> nn.Module:
+    return InDtype(conv, library.dtype)
 
 
 @fast.register
-def _(layer: PatchProjection, libraries: Libraries) -> nn.Module:
-    own = libraries.dtype == torch.float32
-    return FastProjection(layer) if own else InDtype(layer, libraries.dtype)
+def _(layer: PatchProjection, library: Own) -> nn.Module:
+    own = library.dtype == torch.float32
+    return FastProjection(layer) if own else InDtype(layer, library.dtype)
 
 
 class FastProjection(nn.Module):
@@ -97,10 +97,10 @@ class FastProjection(nn.Module):
 
 
 @fast.register
-def _(block: ConvBlock, libraries: Libraries) -> nn.Module:
+def _(block: ConvBlock, library: Own) -> nn.Module:
     conv1, norm1, _, conv2, norm2, _ = list[Any](block)
     fused = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
-    first, second = (InDtype(conv, libraries.dtype) for conv in fused)
+    first, second = (InDtype(conv, library.dtype) for conv in fused)
     return nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
 
 
@@ -108,11 +108,11 @@ def _(block: ConvBlock, libraries: Libraries) -> nn.Module:
 class FastEmbed(nn.Module):
     """The embedding of samples, in float32."""
 
-    def __init__(self, embed: PolarPatchEmbed, libraries: Libraries):
+    def __init__(self, embed: PolarPatchEmbed, library: Own):
         super().__init__()
-        own = Own(libraries.weights)
+        own = Own(library.weights)
         self.proj, self.norm = own.linear(embed.proj), own.norm(embed.norm)
-        self.dtype = libraries.dtype
+        self.dtype = library.dtype
 
     def forward(self, x: Tensor) -> Tensor:
         refuse_gradients(x)
@@ -123,10 +123,10 @@ class FastEmbed(nn.Module):
 class FastMerging(PatchMerging):
     """The merging of tokens, with the norm and the product of a library."""
 
-    def __init__(self, merging: PatchMerging, libraries: Libraries):
+    def __init__(self, merging: PatchMerging, library: Own):
         nn.Module.__init__(self)
         self.merge = merging.merge
-        self.product = libraries.of(merging).linear(merging.reduction, merging.norm)
+        self.product = library.linear(merging.reduction, merging.norm)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.product(self.joined(x))
@@ -137,17 +137,17 @@ class FastStage(nn.Module):
     """A stage whose blocks a library computes, in parts if the batch is large. Our own operator
     takes parts itself."""
 
-    def __init__(self, stage: Stage, libraries: Libraries):
+    def __init__(self, stage: Stage, library: Own):
         super().__init__()
-        self.downsample = fast(stage.downsample, libraries)
+        self.downsample = fast(stage.downsample, library)
         blocks: list[Any] = list(stage.blocks)
         if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
             raise ValueError("both products of an MLP must be quantized, or none")
-        self.blocks = libraries.of(stage.blocks).blocks(blocks)
+        self.blocks = library.blocks(blocks)
         layers = [block.mlp.fc1 for block in blocks]
         # The widest tokens are queries, keys and values, or those within the MLP.
         widest = max([3, *(-(-layer.out_features // layer.in_features) for layer in layers)])
-        self.most_numbers = max(CACHED_BYTES // (widest * libraries.dtype.itemsize), 1)
+        self.most_numbers = max(CACHED_BYTES // (widest * library.dtype.itemsize), 1)
         biases = [block.attn.position_bias for block in blocks]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         self.heads = [bias.heads for bias in relative]

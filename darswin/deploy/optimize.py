@@ -1,7 +1,7 @@
 """Fast copies of models for inference on CPUs.
 
-In float32 all blocks of a stage are one C++ operator, and in int8 too, except on CPUs with AMX.
-There, and in bfloat16, oneDNN computes the products, and the norm that follows a residual adds it.
+In float32 and int8 the whole network is one C++ operator, on every CPU. In bfloat16 oneDNN computes
+the products, and the norm that follows a residual adds it.
 """
 
 import copy
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
 from darswin.deploy.networks import Programs
-from darswin.deploy.packed import Libraries, OneDNN, fastest_dtype
+from darswin.deploy.packed import fastest_dtype, library_of
 from darswin.deploy.program import NoProgramError, Weights
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import onednn_lack
@@ -73,14 +73,6 @@ def optimize(
             without int8 or for a quantized model; int8 with neither.
         ImportError: darswin's compiled module cannot be loaded.
     """
-    return optimized(model, dtype, lens, batches, strict=strict)
-
-
-def optimized(
-    model: Net, dtype: torch.dtype | Literal["fastest"] = torch.float32, lens: Lens | None = None,
-    batches: Iterable[Sequence] | None = None, *, strict: bool = False, own_alone: bool = False,
-) -> Net:  # fmt: skip
-    """`optimize`; own_alone: by our own operators, where oneDNN is faster too."""
     check_model(model, dtype, lens)
     _module.require("optimize")
     if dtype == "fastest":
@@ -91,21 +83,20 @@ def optimized(
     elif batches is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
-        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=3)
-    libraries = Libraries(dtype, own_alone=own_alone)
-    by_onednn = isinstance(libraries.of(model), OneDNN)
+        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
+    library = library_of(dtype)
     made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
-    fast(made, libraries)
+    fast(made, library)
     for part in made.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype)
-    vars(made).update(fixed_lens=lens, known={}, weights=libraries.weights)
-    lack = "oneDNN, whose products are faster here" if by_onednn else ""
+    vars(made).update(fixed_lens=lens, known={}, weights=library.weights)
+    lack = "bfloat16, whose products oneDNN computes" if dtype == torch.bfloat16 else ""
     if not lack:
         try:
-            vars(made).update(programs=Programs(made, made.layers, libraries.weights))
+            vars(made).update(programs=Programs(made, made.layers, library.weights))
         except NoProgramError as error:
             lack = str(error)
     if lack and strict:

@@ -26,12 +26,7 @@ from darswin.deploy.own import (
 from darswin.deploy.program import Checked, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import onednn_lack
-from darswin.layers.quantized import (
-    Quantization,
-    QuantizedLinear,
-    quantize,
-    quantized_layers,
-)
+from darswin.layers.quantized import quantize
 from darswin.models.dat import DeformableAttention
 
 Key = TypeVar("Key")
@@ -44,12 +39,6 @@ _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 
 
 _ADD_NORM = own_operator("_add_norm_")
-_ADD_NORM_QUANTIZED = own_operator("_add_norm_quantized_")
-
-
-def has_own_int8() -> bool:
-    """True if our own kernels compute 8-bit products here: not where oneDNN uses AMX."""
-    return not (torch.cpu._is_amx_tile_supported() and onednn_lack(torch.int8) is None)
 
 
 class OwnBlocks(PackedBlocks):
@@ -75,10 +64,12 @@ class OwnBlocks(PackedBlocks):
 
 
 class Own:
-    """Our own operators, in float32 and, if `has_own_int8`, of quantized layers.
+    """Our own operators, in float32 and of quantized layers.
 
     Args: weights: of the programs of a model; None for layers alone.
     """
+
+    dtype = torch.float32  # of the maps between layers
 
     def __init__(self, weights: Weights | None = None):
         self.weights = Weights() if weights is None else weights
@@ -101,56 +92,45 @@ class Own:
 
 
 class OneDNN(Own):
-    """oneDNN's products in bfloat16 and of quantized layers, and our own in float32.
+    """oneDNN's products in bfloat16, and our own in float32 and of quantized layers.
 
-    Each layer is an operator, but a sum and the norm of it are one. Where oneDNN lacks a kind of
-    product, torch computes those in bfloat16, and our own operators those of quantized layers.
+    Each layer is an operator, but a sum and the norm of it are one. Where oneDNN lacks bfloat16,
+    torch computes its products.
     """
 
     def __init__(self, dtype: torch.dtype, weights: Weights | None = None):
         super().__init__(weights)
         self.dtype = dtype
 
-    def linear(
-        self,
-        layer: Any,
-        norm: Any = None,
-        *,
-        gelu: bool = False,
-        result: Quantization | None = None,
-    ) -> Layer:
-        """As `Own.linear`. A quantized layer without a norm takes uint8 of its quantization. With a
-        quantization for the result, that is uint8 too."""
-        taken = taken_by(layer)
-        if taken is not None:
-            product = _quantized_product(layer, result)
-        elif self.dtype == torch.float32:
-            return super().linear(layer, norm, gelu=gelu)
-        else:
-            product = _product(layer, self.dtype, gelu)
+    def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
+        """As `Own.linear`, but a quantized layer takes float32 without a norm too."""
+        if self.dtype == torch.float32:
+            product = super().linear(layer, norm, gelu=gelu)
+            taken = taken_by(layer)
+            if norm is not None or taken is None:
+                return product
+            return lambda x: product(quantize(x, taken))
+        product = _product(layer, self.dtype, gelu)
         if norm is None:
             return product
-        normed = self.norm(norm, taken)
+        normed = self.norm(norm)
         return lambda x: product(normed(x))
 
-    def norm(self, norm: nn.LayerNorm, quantization: Quantization | None = None) -> Layer:
-        """A layer norm. Its result is uint8 if a quantization is given."""
-        weight, bias = norm_parameters(norm)
-        if quantization is not None:
-            given = (weight, bias, norm.eps, *quantization)
-            return lambda x: _ADD_NORM_QUANTIZED(x.contiguous(), None, *given)
+    def norm(self, norm: nn.LayerNorm) -> Layer:
+        """A layer norm."""
         if self.dtype == torch.float32:
             return super().norm(norm)
+        weight, bias = norm_parameters(norm)
         return lambda x: torch.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
 
     def blocks(self, blocks: Sequence[Any]) -> Blocks:
         """The blocks of a stage, layer by layer. The next norm adds the branch of the last one."""
         layers = [
             (
-                self._add_norm(block.norm1, taken_by(block.attn, "qkv")),
+                self._add_norm(block.norm1),
                 self._attention(block.attn),
-                self._add_norm(block.norm2, taken_by(block.mlp, "fc1")),
-                self.linear(block.mlp.fc1, gelu=True, result=taken_by(block.mlp, "fc2")),
+                self._add_norm(block.norm2),
+                self.linear(block.mlp.fc1, gelu=True),
                 self.linear(block.mlp.fc2),
             )
             for block in blocks
@@ -167,21 +147,19 @@ class OneDNN(Own):
         return run
 
     def _add_norm(
-        self, norm: nn.LayerNorm, quantization: Quantization | None
+        self, norm: nn.LayerNorm
     ) -> Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]:
         """The residual and a branch to add, or None → their sum, and the norm of the sum.
 
         The sum overwrites the residual, and the norm may overwrite the branch.
         """
-        alone, given = self.norm(norm, quantization), (*norm_parameters(norm), norm.eps)
+        alone, given = self.norm(norm), (*norm_parameters(norm), norm.eps)
 
         def run(x: Tensor, branch: Tensor | None) -> tuple[Tensor, Tensor]:
             x = x.contiguous()
             if branch is None:
                 return x, alone(x)
             branch = branch.contiguous()
-            if quantization is not None:
-                return x, _ADD_NORM_QUANTIZED(x, branch, *given, *quantization)
             _ADD_NORM(x, branch, *given)
             return x, branch
 
@@ -194,32 +172,13 @@ class OneDNN(Own):
         qkv, proj = self.linear(attn.qkv), self.linear(attn.proj)
         sizes = (3, attn.num_heads, attn.dim // attn.num_heads)
         attend = _OPS.window_attention.default
-        given: tuple = (attn.window, attn.shift, attn.periodic, sizes[2] ** -0.5)
-        if (quantization := taken_by(attn, "proj")) is not None:
-            attend, given = _OPS._window_attention_quantized.default, (*given, *quantization)
+        given = attn.window, attn.shift, attn.periodic, sizes[2] ** -0.5
         return lambda x, table: proj(attend(qkv(x).unflatten(-1, sizes), table, *given))
 
 
-class Libraries:
-    """The libraries that compute the parts of a model fastest here.
-
-    Args:
-        dtype: of the maps between the layers.
-        own_alone: chooses our own operators where oneDNN is faster too.
-
-    Attributes:
-        weights: of the programs of the model.
-    """
-
-    def __init__(self, dtype: torch.dtype, *, own_alone: bool = False):
-        self.dtype, self.weights, self._own_alone = dtype, Weights(), own_alone
-
-    def of(self, layer: nn.Module) -> Own:
-        """The library of a layer, or of a part of a model."""
-        own = self.dtype == torch.float32 and (
-            not quantized_layers(layer) or self._own_alone or has_own_int8()
-        )
-        return Own(self.weights) if own else OneDNN(self.dtype, self.weights)
+def library_of(dtype: torch.dtype) -> Own:
+    """The library that computes the parts of a model; dtype: of the maps between its layers."""
+    return Own() if dtype == torch.float32 else OneDNN(dtype)
 
 
 def _product(linear: Any, dtype: torch.dtype, gelu: bool) -> Layer:
@@ -240,28 +199,6 @@ def onednn_linear(weight: Tensor, bias: Tensor | None, *, gelu: bool = False) ->
     product = torch.ops.mkldnn._linear_pointwise.default
     after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
     return lambda x: product(x, packed, bias, *after)
-
-
-def _quantized_product(layer: QuantizedLinear, result: Quantization | None) -> Layer:
-    """A quantized layer: float32, or its GELU as uint8 of the quantization `result`. By oneDNN if
-    its sums are exact here."""
-    if onednn_lack(torch.int8) is not None:
-        own = OwnLinear(packed_weights(layer), layer.out_features, gelu=result is not None)
-        return own if result is None else lambda q: quantize(own(q), result)
-    columns, dtype = layer.out_features, torch.float32 if result is None else torch.uint8
-    weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
-    zero_points = torch.zeros(columns, dtype=torch.int64)
-    scales = layer.weight_scale.detach().clone()
-    after: tuple = (*(result or (1.0, 0)), dtype, "none" if result is None else "gelu", [], "none")
-    given = (*layer.activation, weight, scales, zero_points, layer.bias, *after)
-    product = torch.ops.onednn.qlinear_pointwise.default
-
-    def run(q: Tensor) -> Tensor:
-        if not q.numel():  # oneDNN gives another shape
-            return q.new_empty((*q.shape[:-1], columns), dtype=dtype)
-        return product(q, *given)
-
-    return run
 
 
 class InDtype(nn.Module):
@@ -304,7 +241,7 @@ def fastest_dtype() -> torch.dtype:
     x = torch.ones(512, 384)
     linear = nn.utils.skip_init(nn.Linear, 384, 1536)  # which draws no random numbers
     nn.init.ones_(linear.weight)
-    runs = {d: partial(Libraries(d).of(linear).linear(linear), x.to(d)) for d in dtypes}
+    runs = {d: partial(library_of(d).linear(linear), x.to(d)) for d in dtypes}
     with torch.inference_mode():
         seconds = best_seconds(runs, turns=9)
     return min(seconds, key=seconds.__getitem__)

@@ -4,8 +4,7 @@ In float32, torch uses its BLAS. In the wheels for x86-64 this is MKL, which is 
 oneDNN on AMD's CPUs. oneDNN is part of torch's own library.
 """
 
-from functools import cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,7 @@ MATMUL_BACKENDS = get_args(MatmulBackend)
 
 def onednn_lack(dtype: torch.dtype) -> str | None:
     """The reason why oneDNN cannot compute products in `dtype` here, or None if it can."""
-    if dtype not in (torch.float32, torch.bfloat16, torch.int8):
+    if dtype not in (torch.float32, torch.bfloat16):
         return f"oneDNN has no products in {dtype}"
     if not torch.backends.mkldnn.is_available():
         return f"torch {torch.__version__} is built without oneDNN"
@@ -27,36 +26,7 @@ def onednn_lack(dtype: torch.dtype) -> str | None:
         return f"torch {torch.__version__} has no linear operator of oneDNN"
     if dtype == torch.bfloat16 and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
         return "oneDNN has no bfloat16 products on this CPU"
-    if dtype == torch.int8:
-        if not hasattr(torch.ops.onednn, "qlinear_pointwise"):
-            return f"torch {torch.__version__} has no int8 products of oneDNN"
-        if not _has_int8():
-            return "this CPU has no VNNI, the instructions of int8 products"
-        if not _int8_is_exact():
-            return "oneDNN's int8 products overflow: ONEDNN_MAX_CPU_ISA keeps it from using VNNI"
     return None
-
-
-def _has_int8() -> bool:
-    # With VNNI, products of 8 bits are added in 32 bits; without it, they overflow in 16 bits.
-    if torch.cpu._is_vnni_supported():
-        return True
-    capabilities: Any = getattr(torch.cpu, "get_capabilities", dict)  # missing in older torch
-    return any(capabilities().get(name) for name in ("avx_vnni", "amx_int8"))
-
-
-@cache
-def _int8_is_exact() -> bool:
-    """True if the largest possible product is right; it is wrong without VNNI."""
-    size, largest = 64, 127
-    weight = torch.full((size, size), largest, dtype=torch.int8)
-    packed = torch.ops.onednn.qlinear_prepack(weight, None)
-    scales, zero_points = torch.ones(size), torch.zeros(size, dtype=torch.int64)
-    q = torch.full((size, size), 255, dtype=torch.uint8)
-    found = torch.ops.onednn.qlinear_pointwise.default(
-        q, 1.0, 0, packed, scales, zero_points, None, 1.0, 0, torch.float32, "none", [], "none"
-    )
-    return bool((found == size * largest * 255).all())
 
 
 def _onednn_product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:

@@ -51,8 +51,6 @@ def load() -> ctypes.CDLL:
     module.darswin_set_tier.restype = ctypes.c_bool
     module.darswin_use_torch_threads.argtypes = [ctypes.c_bool]
     module.darswin_use_torch_threads.restype = None
-    module.darswin_allow_fours.argtypes = [ctypes.c_bool]
-    module.darswin_allow_fours.restype = ctypes.c_bool
     return module
 
 
@@ -86,13 +84,17 @@ def set_tier(tier: str) -> None:
         )
 
 
-def allow_fours(allowed: bool) -> bool:
-    """Says whether 8-bit layers may use instructions for four bytes at a time, such as VNNI.
+BYTE_PRODUCTS = ("pairs", "fours", "tiles")  # from slow to fast
 
-    They may at first. The results are the same. Returns True if the CPU and the tier have them, and
-    they are allowed.
+
+def byte_products(most: str | None = None) -> str:
+    """How 8-bit layers multiply, after an optional limit. The results are the same.
+
+    "pairs": as numbers of 16 bits. "fours": by an instruction for four bytes, such as VNNI.
+    "tiles": by AMX, the limit at first. The CPU, the system and the tier may lack the last two.
     """
-    return False if _loaded is None else _loaded.darswin_allow_fours(allowed)
+    limit = -1 if most is None else BYTE_PRODUCTS.index(most)
+    return BYTE_PRODUCTS[0 if _loaded is None else _loaded.darswin_byte_products(limit)]
 
 
 def torch_threads_switch() -> Callable[[bool], None]:

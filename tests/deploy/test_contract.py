@@ -22,9 +22,8 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin import create_model, frames, list_models, optimize
-from darswin.deploy import camera, packed
+from darswin.deploy import camera
 from darswin.deploy.export import export_onnx
-from darswin.deploy.optimize import optimized
 from darswin.lens import Equidistant, Mei
 from darswin.models import Encoder, LensAdapter
 from darswin.models.adapter import adapted
@@ -185,13 +184,10 @@ def test_so_do_the_large_sizes(family, tmp_path):
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    ("case", "own"),
-    product([*((name, None) for name in [*CLASSIFIERS, *UNETS, "maps"]), ("swin", "mercator")],
-            [True, False]), ids=str,
+    ("family", "view"),
+    [*((name, None) for name in [*CLASSIFIERS, *UNETS, "maps"]), ("swin", "mercator")], ids=str,
 )  # fmt: skip
-def test_so_it_does_in_8_bits(case, own, tmp_path, monkeypatch):
-    family, view = case
-    monkeypatch.setattr(packed, "has_own_int8", lambda: own)  # False: this CPU has AMX
+def test_so_it_does_in_8_bits(family, view, tmp_path):
     network = model_of(features_only=True) if family == "maps" else model_of(family)
     model, whole = quantized_of(network), network
     if view is not None:
@@ -202,7 +198,7 @@ def test_so_it_does_in_8_bits(case, own, tmp_path, monkeypatch):
     frame = random_frame(*size_of(model), 3, seed=7)
     images = torch.from_numpy(frame)[None]
     expected = finished(whole, whole(images, ROUND))
-    direct = optimized(model, torch.int8, own_alone=True)  # oneDNN rounds otherwise
+    direct = optimize(model, torch.int8)
     polar = "darswin" in family or family == "maps"
     found = [finished(model, direct(images, ROUND)), by_file(model, ROUND, frame, tmp_path)]
     # A view is sampled by another operator: a rounding may fall to the other side.

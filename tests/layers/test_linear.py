@@ -87,11 +87,6 @@ def test_the_reason_why_there_is_no_onednn(monkeypatch):
     assert "float64" in onednn_lack(torch.float64)
     with torch.backends.mkldnn.flags(enabled=False):
         assert "enabled is False" in onednn_lack(torch.float32)
-    int8, cpu, mkldnn = torch.int8, torch.cpu, torch.ops.mkldnn
+    mkldnn = torch.ops.mkldnn
     lacks(torch.bfloat16, "this CPU", mkldnn, "_is_mkldnn_bf16_supported", False)
-    monkeypatch.setattr(cpu, "get_capabilities", dict, raising=False)
-    lacks(int8, "no VNNI", cpu, "_is_vnni_supported", False)
-    monkeypatch.setattr(linear, "_int8_is_exact", lambda: False)
-    lacks(int8, "overflow", cpu, "get_capabilities", {"amx_int8": True})
-    lacks(int8, None, linear, "_int8_is_exact", True)
     lacks(torch.float32, "without oneDNN", torch.backends.mkldnn, "is_available", False)

@@ -12,7 +12,7 @@ namespace {
 constexpr int kRegister = 32;  // bytes
 constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
 constexpr bool kFused = true;
-constexpr bool kHasFours = true, kSignedFours = false;
+constexpr bool kHasFours = true, kSignedFours = false, kHasTiles = false;
 
 using Floats = Vector<float, 8>;
 using Doubles = Vector<double, 4>;

@@ -13,7 +13,7 @@ namespace {
 constexpr int kRegister = 64;  // bytes
 constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
 constexpr bool kFused = true;
-constexpr bool kHasFours = true, kSignedFours = false;
+constexpr bool kHasFours = true, kSignedFours = false, kHasTiles = true;
 
 using Floats = Vector<float, 16>;
 using Doubles = Vector<double, 8>;
@@ -63,6 +63,83 @@ inline Vector<int32_t, 16> add_fours(Vector<int32_t, 16> sums, Vector<uint32_t, 
   asm("vpdpbusd %2, %1, %0" : "+v"(sums) : "v"(x), "v"(weights));
   return sums;
 }
+
+// The tiles of AMX: registers of up to 16 rows of 64 bytes. Tiles 0 to 2 have sums, 3 tokens, 4 and 5
+// weights; 6 and 7 have the last tokens and weights of a depth that fills no whole tile.
+struct AmxTiles {
+  // Says how many tokens a tile has, and how many words the last tile of a depth.
+  static void shape(int64_t rows, int64_t last) {
+    struct {
+      uint8_t palette = 1, unused[15] = {};
+      uint16_t bytes[16] = {64, 64, 64, 64, 64, 64};
+      uint8_t rows[16] = {};
+    } shapes;
+    for (int k = 0; k < 4; ++k) shapes.rows[k] = static_cast<uint8_t>(rows);
+    shapes.rows[4] = shapes.rows[5] = 16;
+    if (last > 0) {
+      shapes.bytes[6] = static_cast<uint16_t>(4 * last), shapes.rows[6] = shapes.rows[0];
+      shapes.bytes[7] = 64, shapes.rows[7] = static_cast<uint8_t>(last);
+    }
+    asm volatile("ldtilecfg %0" : : "m"(shapes));
+  }
+
+  // Gives them back: the system keeps the tiles of a thread that has any.
+  static void release() { asm volatile("tilerelease"); }
+
+  // Adds the products of so many words of tokens and of weights (words, width) to kWide tiles of
+  // sums, whose rows are `pitch` bytes apart. The sums start at zero if `starts`.
+  template <int kWide>
+  static void multiply(const uint8_t* x, int64_t depth, const uint32_t* weights, int64_t width,
+                       int64_t words, void* sums, int64_t pitch, bool starts) {
+    auto* to = static_cast<char*>(sums);
+    if (starts) {
+      asm volatile("tilezero %%tmm0; tilezero %%tmm1; tilezero %%tmm2" : :);
+    } else {
+      load<0>(to, pitch);
+      if constexpr (kWide > 1) load<1>(to + 64, pitch);
+      if constexpr (kWide > 2) load<2>(to + 128, pitch);
+    }
+    for (; words >= 16; words -= 16, x += 64, weights += 16 * width) {
+      add<kWide, 3, 4, 5>(x, depth, weights, width);
+    }
+    if (words > 0) add<kWide, 6, 7, 7>(x, depth, weights, width);
+    store<0>(to, pitch);
+    if constexpr (kWide > 1) store<1>(to + 64, pitch);
+    if constexpr (kWide > 2) store<2>(to + 128, pitch);
+  }
+
+ private:
+  // Assembly needs no flag of the compiler, which itself uses no tiles.
+  template <int kTile>
+  static void load(const void* from, int64_t pitch) {
+    asm volatile("tileloadd (%0,%1), %%tmm%c2" : : "r"(from), "r"(pitch), "i"(kTile) : "memory");
+  }
+  template <int kTile>
+  static void store(void* to, int64_t pitch) {
+    asm volatile("tilestored %%tmm%c2, (%0,%1)" : : "r"(to), "r"(pitch), "i"(kTile) : "memory");
+  }
+  template <int kSums, int kTokens, int kWeights>
+  static void add_products() {
+    asm volatile("tdpbusd %%tmm%c2, %%tmm%c1, %%tmm%c0"
+                 :
+                 : "i"(kSums), "i"(kTokens), "i"(kWeights));
+  }
+  template <int kWide, int kTokens, int kFirst, int kSecond>
+  static void add(const uint8_t* x, int64_t depth, const uint32_t* weights, int64_t width) {
+    const int64_t pitch = width * static_cast<int64_t>(sizeof(uint32_t));
+    load<kTokens>(x, depth);
+    load<kFirst>(weights, pitch);
+    add_products<0, kTokens, kFirst>();
+    if constexpr (kWide > 1) {
+      load<kSecond>(weights + 16, pitch);
+      add_products<1, kTokens, kSecond>();
+    }
+    if constexpr (kWide > 2) {
+      load<kFirst>(weights + 32, pitch);
+      add_products<2, kTokens, kFirst>();
+    }
+  }
+};
 
 // The rest is only for registers of 512 bits, which hold four pixels of four channels.
 

@@ -19,7 +19,7 @@ constexpr int kRegister = 16;  // bytes
 constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
 constexpr bool kFused = false;
 // There is add_fours, and it takes signed bytes: those of tokens less 128.
-constexpr bool kHasFours = false, kSignedFours = false;
+constexpr bool kHasFours = false, kSignedFours = false, kHasTiles = false;
 
 using Floats = Vector<float, 4>;
 using Doubles = Vector<double, 2>;

@@ -15,9 +15,9 @@ constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
 constexpr bool kFused = true;
 #if defined(__clang__) && !defined(__ARM_FEATURE_DOTPROD)
 // Clang assembles no instruction that its target lacks. Apple's targets have this one.
-constexpr bool kHasFours = false, kSignedFours = false;
+constexpr bool kHasFours = false, kSignedFours = false, kHasTiles = false;
 #else
-constexpr bool kHasFours = true, kSignedFours = true;
+constexpr bool kHasFours = true, kSignedFours = true, kHasTiles = false;
 #endif
 
 using Floats = Vector<float, 4>;
