@@ -3,6 +3,8 @@
 // Interpolation goes first downwards, then to the right, four channels at a time.
 #pragma once
 
+#include <utility>
+
 #include "polar_rows.h"
 
 namespace darswin {
@@ -64,6 +66,56 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t 
   }
   for (int64_t e = 0; e < packed.row; ++e) to[e] = 0;
   for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
+}
+
+// Packs a channel of image b by itself. A packed pixel has the four pixels around the points whose
+// upper left pixel it is. `rows` has room for two rows of the image and their borders.
+template <typename T, typename E>
+void pack_corners(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t channel,
+                  T* rows, T* to) {
+  const int64_t width = a.width + 4;  // of a row and its borders
+  const E* image =
+      static_cast<const E*>(a.image) + b * a.image_stride[0] + channel * a.image_stride[1];
+  const auto read = [&](int64_t y, T* row) {
+    for (int64_t x = 0; x < width; ++x) row[x] = 0;
+    const E* from = image + y * a.image_stride[2];
+    for (int64_t x = 0; x < a.width && y < a.height; ++x) {
+      row[x + 1] = load<T>(from + x * a.image_stride[3]);
+    }
+  };
+  T *upper = rows, *lower = rows + width;
+  for (int64_t x = 0; x < width; ++x) lower[x] = 0;
+  for (int64_t y = 0; y < a.height + 3; ++y, to += packed.row) {
+    std::swap(upper, lower);
+    read(y, lower);
+    const T* const corners[] = {upper, upper + 1, lower, lower + 1};
+    interleave<T>(corners, a.width + 3, to, 4);
+  }
+}
+
+// Samples `count` points of such an image, one after the other.
+template <typename T>
+[[gnu::noinline]] void sample_corners(const T* pixels, const PackedPlaces<T>& places, int64_t first,
+                                      int64_t count, T* to) {
+  const int32_t* offset = places.offset + first;
+  const T *right = places.right + first, *lower = places.lower + first;
+  int64_t k = 0;
+  if constexpr (is_same_v<T, float>) {
+    constexpr int kL = kLanes<float>;
+    for (; count >= kL && k < count; k += kL) {
+      k = smaller(k, count - kL);  // the last points may be sampled again
+      Floats v[4];                 // v[p] has points p, p + 4, ..., and then corner p of all points
+#pragma GCC unroll 4
+      for (int p = 0; p < 4; ++p) v[p] = quads(pixels, offset + k + p);
+      transpose_quads(v);
+      store(to + k,
+            bilinear(v[0], v[1], v[2], v[3], load<Floats>(right + k), load<Floats>(lower + k)));
+    }
+  }
+  for (; k < count; ++k) {
+    const T* p = pixels + offset[k];
+    to[k] = bilinear(p[0], p[1], p[2], p[3], right[k], lower[k]);
+  }
 }
 
 // Interpolates four channels of a point, and calls write(e, v) for the channels from e on. The

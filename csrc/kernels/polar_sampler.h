@@ -51,6 +51,7 @@ class Sampler {
     channels = a.packed && !a.tokens ? smaller(a.channels - first, packed.pixel) : a.channels;
     if (!a.packed) return;
     with_pixel_type<T>(a.pixel, [&]<typename E>() {
+      if (corners()) return pack_corners<T, E>(a, packed, b, first, pixels + packed.size, pixels);
       pack<T, E>(a, packed, b, first, pixels + packed.size + 16, pixels);
     });
   }
@@ -80,6 +81,9 @@ class Sampler {
     ByteBlock bytes;
     T samples[4 * kBlock];
   };
+
+  // Whether the image in hand has one channel, and its packed pixels have four pixels of it.
+  bool corners() const { return !a.tokens && channels == 1 && a.pixel != Pixel::u8; }
 
   // A packed image has all channels of a pixel, or four of them if the samples are planes.
   static Packed packed_layout(const PolarSampleArgs<T>& a) {
@@ -169,6 +173,10 @@ class Sampler {
 
   // Samples the planes of a block, `rows` times `count` points of a packed image.
   void planes(int64_t rows, int64_t count, T* to) const {
+    for (int64_t n = 0; n < rows && corners(); ++n) {
+      sample_corners(pixels, points.packed, n * count, count, to + n * strides.row);
+    }
+    if (corners()) return;
     with_normalization([&]<Normalization how>() {
       for (int64_t n = 0; n < rows; ++n) {
         sample_planes<how>(a, pixels, packed.row, points.packed, n * count, count, channels,

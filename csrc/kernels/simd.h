@@ -87,6 +87,22 @@ inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
   for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
 }
 
+// Joins the four floats at from + at[0], from + at[4], ... to a register.
+template <int kQuads = kLanes<float> / 4>
+inline Vector<float, 4 * kQuads> quads(const float* from, const int32_t* at) {
+  if constexpr (kQuads == 1) {
+    return load<Vector<float, 4>>(from + *at);
+  } else {
+    const auto front = quads<kQuads / 2>(from, at), back = quads<kQuads / 2>(from, at + 2 * kQuads);
+    if constexpr (kQuads == 2) {
+      return __builtin_shufflevector(front, back, 0, 1, 2, 3, 4, 5, 6, 7);
+    } else {
+      return __builtin_shufflevector(front, back, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14,
+                                     15);
+    }
+  }
+}
+
 // Transposes the 4 x 4 square within each 128 bits of four registers.
 inline void transpose_quads(Floats* rows) {
   constexpr int kL = kLanes<float>;
