@@ -93,10 +93,21 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
     step, targets = forward(ours, [images]), {remaps: 2.4 if small else 1.4}
     check(case("forward"), {OURS: step, remaps: remapped}, 0.05)
     timings += measure(case("forward"), {OURS: step, remaps: remap}, seconds, targets=targets)[1:]
+    pair, least = {OURS: drop_in, peer: planes}, 2.5 if size == 64 else 1.8
     timings += compare(
-        case("forward, layout image"), {OURS: drop_in, peer: planes}, [images], seconds,
-        targets={peer: 1.0}, tolerance=tolerance,
+        case("forward, layout image"), pair, [images], seconds,
+        targets={peer: least}, tolerance=tolerance,
     )  # fmt: skip
+    timings += compare(
+        case("forward+backward, layout image"), pair, [images], seconds,
+        targets={peer: 3.5}, tolerance=tolerance,
+    )  # fmt: skip
+    for channels in (1, 16, 64) if small else ():
+        timings += compare(
+            case(f"forward, layout image, channels: {channels}"), pair,
+            [torch.randn(batch, channels, size, size)], seconds,
+            targets={peer: 1.0}, tolerance=tolerance,
+        )  # fmt: skip
     jittered = {OURS: lambda image: ours(image, jitter=1.0, seed=1), "darswin without jitter": ours}
     timings += compare(
         case("forward, jitter"), jittered, [images], seconds,
