@@ -71,7 +71,7 @@ bool cpu_has_fours([[maybe_unused]] Tier tier) {
 // The registers are large, so a process has them only after it has asked for them.
 bool has_tiles() {
 #if defined(__x86_64__) && defined(__linux__)
-  constexpr unsigned kAmx = 1 << 24 | 1 << 25;          // the tiles, and their products of bytes
+  constexpr unsigned kAmx = 1 << 24 | 1 << 25;      // the tiles, and their products of bytes
   constexpr int kRequest = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
   unsigned a = 0, b = 0, c = 0, d = 0;
   return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (d & kAmx) == kAmx &&
