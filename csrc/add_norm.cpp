@@ -70,6 +70,4 @@ void add_norm_(Tensor x, Tensor y, Tensor weight, Tensor bias, double eps) {
 }  // namespace
 }  // namespace darswin
 
-STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  m.impl("_add_norm_", TORCH_BOX(&darswin::add_norm_));
-}
+STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) { m.impl("_add_norm_", TORCH_BOX(&darswin::add_norm_)); }

@@ -83,8 +83,8 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Returns the way of 8-bit products: 0 pairs, 1 fours, 2 tiles. `most` limits it first, unless it is
-// negative. The results are the same.
+// Returns the way of 8-bit products: 0 pairs, 1 fours, 2 tiles. `most` limits it first, unless it
+// is negative. The results are the same.
 FACT int darswin_byte_products(int most) {
   if (most >= 0) darswin::limit_byte_products(static_cast<darswin::ByteProducts>(most));
   return static_cast<int>(darswin::byte_products());

@@ -17,8 +17,8 @@ bool set_tier(const char* name);      // false if the CPU or the build lacks tha
 
 bool cpu_is_intel();
 
-// How to multiply bytes: as pairs of 16 bits, by the tier's instruction for the products of four, or
-// by the tiles of AMX. The results are the same.
+// How to multiply bytes: as pairs of 16 bits, by the tier's instruction for the products of four,
+// or by the tiles of AMX. The results are the same.
 enum class ByteProducts { pairs, fours, tiles };
 
 // The best way that this CPU, the tier and the limit have. The first call asks Linux for the tiles.

@@ -12,9 +12,9 @@
 // With 8 bits, a number of a token is a word of four depths, if the CPU adds the products of four
 // bytes in one instruction. Other CPUs add the products of two numbers of 16 bits. For them, a word
 // is split into two words of two depths: those of a part of the weights once for all tokens, and
-// those of a few tokens once for all columns of a panel. With AMX, a tile of sums has 16 tokens, and
-// an instruction adds the products of 16 words of each. Every way the sums are integers and exact,
-// so the results are the same.
+// those of a few tokens once for all columns of a panel. With AMX, a tile of sums has 16 tokens,
+// and an instruction adds the products of 16 words of each. Every way the sums are integers and
+// exact, so the results are the same.
 #include "../linear.h"
 
 #include "activations.h"

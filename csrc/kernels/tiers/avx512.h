@@ -64,8 +64,8 @@ inline Vector<int32_t, 16> add_fours(Vector<int32_t, 16> sums, Vector<uint32_t, 
   return sums;
 }
 
-// The tiles of AMX: registers of up to 16 rows of 64 bytes. Tiles 0 to 2 have sums, 3 tokens, 4 and 5
-// weights; 6 and 7 have the last tokens and weights of a depth that fills no whole tile.
+// The tiles of AMX: registers of up to 16 rows of 64 bytes. Tiles 0 to 2 have sums, 3 tokens, 4 and
+// 5 weights; 6 and 7 have the last tokens and weights of a depth that fills no whole tile.
 struct AmxTiles {
   // Says how many tokens a tile has, and how many words the last tile of a depth.
   static void shape(int64_t rows, int64_t last) {
