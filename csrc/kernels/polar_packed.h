@@ -3,8 +3,6 @@
 // Interpolation goes first downwards, then to the right, four channels at a time.
 #pragma once
 
-#include <utility>
-
 #include "polar_rows.h"
 
 namespace darswin {
@@ -86,7 +84,8 @@ void pack_corners(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, 
   T *upper = rows, *lower = rows + width;
   for (int64_t x = 0; x < width; ++x) lower[x] = 0;
   for (int64_t y = 0; y < a.height + 3; ++y, to += packed.row) {
-    std::swap(upper, lower);
+    T* const next = upper;  // std::swap would be a symbol that a tier leaks
+    upper = lower, lower = next;
     read(y, lower);
     const T* const corners[] = {upper, upper + 1, lower, lower + 1};
     interleave<T>(corners, a.width + 3, to, 4);
