@@ -51,13 +51,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t 
         }
         for (int64_t x = 0; x < a.width; ++x) copy[x] = load<T>(source + x * column_stride);
       }
-      if (packed.pixel == 4) {
-        interleave(plane, a.width, row, 4);
-      } else {
-        for (int64_t x = 0; x < a.width; ++x) {
-          for (int64_t c = 0; c < 4; ++c) row[x * packed.pixel + first + c] = plane[c][x];
-        }
-      }
+      interleave(plane, a.width, row + first, packed.pixel);
     }
     row += a.width * packed.pixel;
     for (int64_t e = 0; e < 2 * packed.pixel; ++e) row[e] = 0;

@@ -54,7 +54,7 @@ class Scatter {
   // Adds the gradients of all points, a tile of points after the other: their pixels and gradients
   // stay in the first-level cache.
   void add() {
-    // All of a ring for cells, whose sums wait longest for each other.
+    // A tile of cells is a part of one radius: neighbouring radii would add to the same cells.
     const int64_t tile_radii = keep == kCells ? 1 : 8, most = kBlock / tile_radii;
     const int64_t tile_azimuths =
         a.tokens && a.samples_a <= most ? most - most % a.samples_a : most;
@@ -309,7 +309,7 @@ class Scatter {
   const Packed layout;
   const int64_t image, first_row, end_row;
   PlacedPoints<T>& points;
-  T* grads;  // of a tile, or of one of its radii
+  T* grads;  // of a tile
   T* sums;   // cells or packed image; only the band's rows are there
 };
 
