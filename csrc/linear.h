@@ -54,11 +54,16 @@ enum class After {
 };
 
 // out = x * weight^T + bias
+//
+// Tokens lie in lines of `run` tokens, which begin `pitch` numbers apart. Floats may also lie in
+// `segments` pieces of the depth, which are `pitch` apart too: the neighbours of a pixel do. A
+// matrix of tokens is one line and one segment.
 template <typename X>
 struct LinearArgs {
-  const X* x = nullptr;          // (rows, depth), then kSpare bytes of any value
+  const X* x = nullptr;          // the first token; kSpare bytes of any value follow the last one
   const void* packed = nullptr;  // the layer
   int64_t rows = 0, depth = 0, columns = 0;
+  int64_t stride = depth, run = rows, pitch = 0, segments = 1;  // stride: from token to token
   float scale = 1;  // the size of a step of x, if it has 8 bits
   After after = After::nothing;
   float* out = nullptr;          // (rows, columns)

@@ -94,7 +94,7 @@ Network::Network(std::vector<int64_t> program_, const uint32_t* weights_, int64_
       const int64_t argument = program[reader.at + k];
       require(argument >= -kMostNumbers && argument <= kMostNumbers, "has a number out of range");
     }
-    steps.push_back(checked(static_cast<Opcode>(opcode), &program[reader.at]));
+    append(checked(static_cast<Opcode>(opcode), &program[reader.at]));
     reader.at += arguments;
   }
   check_memory();
@@ -204,6 +204,25 @@ Block Network::block_of(const int64_t* a, bool deforms) const {
   windows.periodic_r = w[4] != 0, windows.periodic_a = w[5] != 0;
   windows.scale = static_cast<float>(1 / std::sqrt(static_cast<double>(dim / heads)));
   return block;
+}
+
+// Appends a step. A convolution does what follows it while its result is in the cache: a sum, and
+// then a function.
+void Network::append(Step step) {
+  const int64_t* a = step.arguments;
+  Step* const before = steps.empty() ? nullptr : &steps.back();
+  if (before != nullptr && before->opcode == Opcode::conv && before->then == After::nothing) {
+    const int64_t out = before->arguments[1];
+    if (step.opcode == Opcode::add && a[1] == out && before->summand < 0) {
+      before->summand = a[0];
+      return;
+    }
+    if (step.opcode == Opcode::apply && a[0] == out && before->summand >= 0) {
+      before->then = static_cast<After>(a[1]);
+      return;
+    }
+  }
+  steps.push_back(std::move(step));
 }
 
 Network::Step Network::checked(Opcode opcode, const int64_t* a) const {

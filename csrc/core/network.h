@@ -79,12 +79,16 @@ class Network {
     Norm norm{};
     Layer layer{};
     Block block{};
+    // A convolution adds this slot, if any, and applies a function to the sum.
+    int64_t summand = -1;
+    After then = After::nothing;
 
     bool is_block() const { return opcode == Opcode::block || opcode == Opcode::deform; }
   };
   struct Run;
 
   Step checked(Opcode opcode, const int64_t* arguments) const;
+  void append(Step step);
   Layer layer_at(int64_t offset, int64_t depth, int64_t columns, int64_t is_quantized) const;
   Norm norm_at(int64_t offset, int64_t dim) const;
   const float* weights_at(int64_t offset, int64_t count) const;

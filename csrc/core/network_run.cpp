@@ -7,6 +7,7 @@
 #include <string>
 
 #include "../elements.h"
+#include "convolution.h"
 #include "dispatch.h"
 #include "network.h"
 #include "parallel.h"
@@ -110,27 +111,32 @@ struct Network::Run {
     return step.is_block() ? step.block.scratch(part(step) * a[1] * a[2]) : 0;
   }
 
+  // The two inner axes are a matrix, of which a thread takes a piece at once.
   void copy(const int64_t* a) const {
     const int64_t *sizes = a + 4, *reads = sizes + kCopyAxes, *writes = reads + kCopyAxes;
-    const int64_t rows = sizes[0] * sizes[1] * sizes[2] * sizes[3];
-    const int64_t most = rows == 1 ? kChunk : sizes[4], parts = units(sizes[4], most);
-    share(batch * rows * parts, most, [&](int64_t begin, int64_t end) {
+    const int64_t height = sizes[3], width = sizes[4];
+    const int64_t across = std::min(width, kChunk), down = std::max(kChunk / across, int64_t{1});
+    const int64_t wide = units(width, across), pieces = units(height, down) * wide;
+    const int64_t outer = sizes[0] * sizes[1] * sizes[2];
+    share(batch * outer * pieces, across * std::min(down, height), [&](int64_t begin, int64_t end) {
       for (int64_t item = begin; item < end; ++item) {
-        const int64_t b = item / (rows * parts), first = item % parts * most;
-        const int64_t count = std::min(most, sizes[4] - first);
-        const float* source = image(a[0], b) + a[2] + first * reads[4];
-        float* target = result(a[1], b) + a[3] + first * writes[4];
-        int64_t row = item / parts % rows;
-        for (int axis = 3; axis >= 0; --axis) {
-          if (sizes[axis] == 1) continue;
-          const int64_t k = row % sizes[axis];
-          row /= sizes[axis];
+        const int64_t b = item / (outer * pieces), piece = item % pieces;
+        const int64_t y = piece / wide * down, x = piece % wide * across;
+        const float* source = image(a[0], b) + a[2] + y * reads[3] + x * reads[4];
+        float* target = result(a[1], b) + a[3] + y * writes[3] + x * writes[4];
+        int64_t place = item / pieces % outer;
+        for (int axis = 2; axis >= 0; --axis) {
+          const int64_t k = place % sizes[axis];
+          place /= sizes[axis];
           source += k * reads[axis], target += k * writes[axis];
         }
-        if (reads[4] == 1 && writes[4] == 1) {
-          std::memcpy(target, source, count * sizeof(float));
-        } else {
-          for (int64_t k = 0; k < count; ++k) target[k * writes[4]] = source[k * reads[4]];
+        const int64_t rows = std::min(down, height - y), columns = std::min(across, width - x);
+        for (int64_t row = 0; row < rows; ++row, source += reads[3], target += writes[3]) {
+          if (reads[4] == 1 && writes[4] == 1) {
+            std::memcpy(target, source, columns * sizeof(float));
+          } else {
+            for (int64_t k = 0; k < columns; ++k) target[k * writes[4]] = source[k * reads[4]];
+          }
         }
       }
     });
@@ -168,61 +174,22 @@ struct Network::Run {
     });
   }
 
-  // Collects the 3 x 3 neighbours of some pixels, and multiplies them as a linear layer. The
-  // threads share the columns too if there are few pixels.
   void conv(const Step& step) const {
-    constexpr int64_t kPixels = 64;          // whose neighbours stay in the cache
-    constexpr double kPerMicrosecond = 5e4;  // multiply-adds
     const int64_t* a = step.arguments;
-    const int64_t pixels = batch * a[2] * a[3], depth = step.layer.depth;
-    const int64_t columns = step.layer.columns, panels = panel_count(columns);
-    const Threads threads =
-        threads_for(static_cast<double>(pixels) * depth * columns / kPerMicrosecond);
-    const int64_t chunks = units(pixels, kPixels);
-    const int64_t parts = std::min(units(threads, chunks), panels);
-    const auto& kernel = kernels<LinearKernels<float>>().rows;
-    run_with_scratch(chunks * parts, threads, kPixels * depth * static_cast<int64_t>(sizeof(float)),
-                     [&](int64_t begin, int64_t end, void* memory) {
-                       auto* tokens = static_cast<float*>(memory);
-                       for (int64_t item = begin; item < end; ++item) {
-                         const int64_t first = item / parts * kPixels, part = item % parts;
-                         const int64_t count = std::min(kPixels, pixels - first);
-                         if (item == begin || part == 0) neighbours(a, first, count, tokens);
-                         const LinearArgs<float> args{.x = tokens,
-                                                      .packed = step.layer.packed,
-                                                      .rows = count,
-                                                      .depth = depth,
-                                                      .columns = columns,
-                                                      .after = static_cast<After>(a[7]),
-                                                      .out = to[a[1]] + first * columns};
-                         kernel(args, 0, count, panels * part / parts, panels * (part + 1) / parts);
-                       }
-                     });
-  }
-  // Writes the neighbours of pixels [first, first + count) of all images.
-  void neighbours(const int64_t* a, int64_t first, int64_t count, float* to) const {
-    const int64_t height = a[2], width = a[3], channels = a[4];
-    for (int64_t pixel = first; pixel < first + count;) {
-      const int64_t row = pixel / width, begin = pixel % width;
-      const int64_t end = std::min(width, begin + first + count - pixel);
-      const float* x = image(a[0], row / height);
-      for (int64_t column = begin; column < end; ++column, to += 9 * channels) {
-        neighbours(x, height, width, channels, row % height, column, to);
-      }
-      pixel += end - begin;
-    }
-  }
-  static void neighbours(const float* x, int64_t height, int64_t width, int64_t channels, int64_t y,
-                         int64_t column, float* to) {
-    for (int64_t row = y - 1; row <= y + 1; ++row, to += 3 * channels) {
-      const int64_t begin = std::max<int64_t>(column - 1, 0), end = std::min(column + 2, width);
-      if (row < 0 || row >= height || begin > column - 1 || end < column + 2) {
-        std::fill_n(to, 3 * channels, 0.0f);
-      }
-      if (row < 0 || row >= height) continue;
-      std::copy_n(x + (row * width + begin) * channels, (end - begin) * channels,
-                  to + (begin - column + 1) * channels);
-    }
+    Convolution{
+        .x = from[a[0]],
+        .stride = rows[a[0]] == 1 ? 0 : numbers(a[0]),
+        .batch = batch,
+        .height = a[2],
+        .width = a[3],
+        .channels = a[4],
+        .layer = step.layer,
+        .after = static_cast<After>(a[7]),
+        .summand = step.summand < 0 ? nullptr : from[step.summand],
+        .summand_stride = step.summand < 0 || rows[step.summand] == 1 ? 0 : numbers(step.summand),
+        .then = step.then,
+        .out = to[a[1]]}
+        .run();
   }
 
   void resize(const int64_t* a) const {

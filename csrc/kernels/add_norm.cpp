@@ -59,12 +59,17 @@ inline float total(Vector<float, kWide> v) {
   }
 }
 
+template <int... lane>
+inline Floats joined(Half lower, Half upper, std::integer_sequence<int, lane...>) {
+  return __builtin_shufflevector(lower, upper, lane...);
+}
+
 // A sum along a row: one register of sums for each turn, and the sum of the remaining columns.
 struct Sum {
   Floats lanes[2]{};
   float rest = 0;
   void add(Floats v, int turn) { lanes[turn] += v; }
-  void add(Half v, int) { rest += total<kL / 2>(v); }
+  void add(Half v, int) { lanes[0] += joined(v, Half{}, std::make_integer_sequence<int, kL>()); }
   void add(float v, int) { rest += v; }
   float all() const { return total<kL>(lanes[0] + lanes[1]) + rest; }
 };

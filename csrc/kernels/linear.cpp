@@ -127,11 +127,11 @@ struct Panel {
   const Word* weight;     // (words, width)
   Sums* sums;             // (rows of the block, kPanel): the sums over the earlier parts
 
-  // A part of the depth.
+  // A part of the depth: a piece of one segment of the tokens, or all segments if they are short.
   struct Part {
-    int64_t begin, end, words;  // of the layer, and words in a tile
-    const Word* weight;         // (words in a tile, width)
-    Sums* start;                // (kPanel,): where the sums start, if not at zero
+    int64_t begin, end, segments, words;  // words of the layer; in a tile, those of a segment
+    const Word* weight;                   // (words in a tile, width)
+    Sums* start;                          // (kPanel,): where the sums start, if not at zero
   };
 
   // Computes kRows rows and kWide registers of columns. The rows of x are `stride` apart.
@@ -143,12 +143,14 @@ struct Panel {
     if constexpr (P::kStarts) {
       each_register<kRows, kWide>([&](int i, int v) { sum[i][v] = part.start[n / kL + v]; });
     }
-    for (int64_t k = 0; k < part.words; ++k) {
-      Weights weights[kWide];
-      for (int v = 0; v < kWide; ++v) weights[v] = load<Weights>(w + k * width + v * kL);
-      each_register<kRows, kWide>([&](int i, int v) {
-        sum[i][v] = P::add(sum[i][v], splat<Weights>(word(x + i * stride, k)), weights[v]);
-      });
+    for (int64_t segment = 0; segment < part.segments; ++segment, x += a.pitch) {
+      for (int64_t k = 0; k < part.words; ++k, w += width) {
+        Weights weights[kWide];
+        for (int v = 0; v < kWide; ++v) weights[v] = load<Weights>(w + v * kL);
+        each_register<kRows, kWide>([&](int i, int v) {
+          sum[i][v] = P::add(sum[i][v], splat<Weights>(word(x + i * stride, k)), weights[v]);
+        });
+      }
     }
     const auto earlier = [&](int i, int v) -> Sums& {
       return so_far[i * kPanel / kL + n / kL + v];
@@ -215,22 +217,19 @@ struct Panel {
     uint8_t* const quantized = a.quantized;
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
-        const int64_t to = place + i * columns + v * kL, count = smaller(kL, left - v * kL);
+        const int64_t to = place + i * columns + v * kL;
+        const int64_t count = left < v * kL ? 0 : smaller(kL, left - v * kL);
         const Floats result = after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
-        if (count < kL || after == After::add) {
+        if (quantized != nullptr && count < kL) {
           float lanes[kL];
           store(lanes, result);
-          for (int64_t lane = 0; lane < count; ++lane) {
-            if (quantized != nullptr) {
-              quantize(quantized + to + lane, lanes[lane]);
-            } else {
-              out[to + lane] = after == After::add ? out[to + lane] + lanes[lane] : lanes[lane];
-            }
-          }
+          for (int64_t lane = 0; lane < count; ++lane) quantize(quantized + to + lane, lanes[lane]);
         } else if (quantized != nullptr) {
           quantize(quantized + to, result);
+        } else if (after == After::add) {
+          store_first(out + to, load_first(out + to, count) + result, count);
         } else {
-          store(out + to, result);
+          store_first(out + to, result, count);
         }
       }
     }
@@ -256,16 +255,15 @@ struct Panel {
   }
 
   template <int kRows>
-  void columns(const Part& part, int64_t row, Sums* so_far) const {
-    const X* token = a.x + row * a.depth + part.begin * kDepths<X>;
+  void columns(const X* token, const Part& part, int64_t row, Sums* so_far) const {
     if constexpr (P::kCopies) {
       Word copy[kRows * kPart];
       for (int i = 0; i < kRows; ++i) {
-        P::copy(token + i * a.depth, part.end - part.begin, copy + i * kPart);
+        P::copy(token + i * a.stride, part.end - part.begin, copy + i * kPart);
       }
       tiles<kRows>(copy, kPart, part, row, so_far);
     } else {
-      tiles<kRows>(token, a.depth, part, row, so_far);
+      tiles<kRows>(token, a.stride, part, row, so_far);
     }
   }
   template <int kRows>
@@ -280,9 +278,11 @@ struct Panel {
     constexpr int64_t kStep = kPart / P::kSplit;
     [[maybe_unused]] alignas(64) Word split[P::kSplit > 1 ? kPart * kPanel : 1];
     [[maybe_unused]] Sums start[kPanel / kL];
-    for (int64_t begin = 0; begin < words; begin += kStep) {
-      const int64_t end = smaller(begin + kStep, words), count = end - begin;
-      Part part{begin, end, count * P::kSplit, weight + begin * width, start};
+    const int64_t segment = words / a.segments;  // words
+    for (int64_t begin = 0, end; begin < words; begin = end) {
+      end = words <= kStep ? words : begin + smaller(kStep, segment - begin % segment);
+      const int64_t count = end - begin, segments = units(count, segment);
+      Part part{begin, end, segments, count / segments * P::kSplit, weight + begin * width, start};
       if constexpr (P::kSplit > 1) {
         P::template split<int16_t>(part.weight, count * width, split);
         // The next part, or that of the next panel, follows in memory.
@@ -306,10 +306,15 @@ struct Panel {
         }
         continue;
       }
-      for (; row + kTileRows <= last_row; row += kTileRows) {
-        columns<kTileRows>(part, row, so_far(row));
+      while (row < last_row) {
+        const int64_t line = row / a.run, last = smaller((line + 1) * a.run, last_row);
+        const X* const first = a.x + line * (a.pitch - a.run * a.stride) +
+                               begin / segment * a.pitch + begin % segment * kDepths<X>;
+        for (; row + kTileRows <= last; row += kTileRows) {
+          columns<kTileRows>(first + row * a.stride, part, row, so_far(row));
+        }
+        for (; row < last; ++row) columns<1>(first + row * a.stride, part, row, so_far(row));
       }
-      for (; row < last_row; ++row) columns<1>(part, row, so_far(row));
     }
   }
 
@@ -333,7 +338,7 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
   typename Panel<P>::Sums sums[kMostRows * kPanel / kL];
   // The block is small enough for its tokens to stay in the second-level cache. Each block reads
   // the whole weight again, so small blocks lose where the weight is larger than the caches.
-  const int64_t fitting = kBlockBytes / (a.depth * static_cast<int64_t>(sizeof(X)));
+  const int64_t fitting = kBlockBytes / (a.stride * static_cast<int64_t>(sizeof(X)));
   const int64_t most = smaller(kMostRows, round_up(1 + fitting, kTileRows));
   const int64_t padded = padded_columns(a.columns), words = depth_words<X>(a.depth);
   const auto* weight = static_cast<const Word*>(a.packed) + kParameters<X> * padded;

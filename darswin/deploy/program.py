@@ -188,19 +188,27 @@ class Program:
         steps: list[Step] = []
         place: dict[tuple[bool, int], tuple[bool, int]] = {}
         made: dict[tuple[bool, int], Step] = {}
-        for k, step in enumerate(self._steps):
+        for k, step in enumerate(map(replace, self._steps)):  # copies, which may change
             base, free = step.base, step.base is not None and last[step.base.key] == k
             if step.opcode == ADD:
                 base, other = step.reads
-                if not (base.is_buffer and free):  # then perhaps the other summand
+                # A convolution adds to its result while that is in the cache.
+                maker = made.get(other.key)
+                of_conv = maker is not None and maker.opcode == CONV and last[other.key] == k
+                if of_conv or not (base.is_buffer and free):  # then perhaps the other summand
                     base, other = other, base
                 free = last[base.key] == k and base.key != other.key
                 step = replace(step, base=base, arguments=(other, step.out))
             if base is not None and base.is_buffer and free:
                 place[step.out.key] = place.get(base.key, base.key)
                 before = made.get(base.key) if readers[base.key] == 1 else None
-                if step.opcode == APPLY and before is not None and before.opcode == CONV:
+                is_plain_conv = (
+                    before is not None and before.opcode == CONV and before.arguments[-1] == NOTHING
+                )
+                if step.opcode == APPLY and is_plain_conv:
+                    assert before is not None
                     before.arguments = (*before.arguments[:-1], step.arguments[-1])
+                    made[step.out.key] = before
                     continue
             elif base is not None and step.opcode != NORM:
                 steps.append(_copy(base, step.out, [(base.numbers, 1, 1)]))

@@ -4,6 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import network, relative_error
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from darswin import optimize
@@ -23,8 +25,7 @@ def run(forward, *images, for_file=False):
     inputs = [x, *more]
     if more and for_file:
         inputs[1] = more[0].permute(0, 2, 3, 1).contiguous()
-    given = [one.expand(len(x), *one.shape[1:]).contiguous() for one in trace.given]
-    found = trace.program.checked()([*inputs, *given])
+    found = trace.program.checked()([*inputs, *trace.given])
     pairs = zip(found, trace.results, strict=True)
     found = [one.permute(inverse(of.order)) for one, of in pairs]
     return found if trace.is_list else found[0]
@@ -34,6 +35,7 @@ CONV, CONV2 = nn.Conv2d(3, 5, 3, padding=1), nn.Conv2d(5, 5, 3, padding=1)
 LINEAR, NORM = nn.Linear(6, 7), nn.LayerNorm(6)
 OWN_LINEAR, OWN_NORM = OwnLinear(packed_weights(LINEAR), 7), OwnNorm(NORM)
 PLACE = torch.randn(1, 4, 6, 6)
+WIDE = torch.randn(1, 5, 4, 6)
 POINTS = torch.rand(1, 3, 4, 2) * 6 - 1
 
 
@@ -83,6 +85,12 @@ IMAGES = {  # functions of images (1, 3, 4, 6)
     "conv and two functions": lambda x: F.relu(F.gelu(CONV(x))),
     "relu": lambda x: F.relu(x),
     "pooled": lambda x: F.max_pool2d(F.max_pool2d(CONV(x), 2, ceil_mode=True), 2, ceil_mode=True),
+    "conv and a sum": lambda x: CONV(x) + WIDE,
+    "conv, a sum and a function": lambda x: F.relu(WIDE + CONV(x)),
+    "conv, a function, a sum and a function": lambda x: F.gelu(F.relu(CONV(x)) + WIDE),
+    "conv, two sums and a function": lambda x: F.gelu((CONV(x) + WIDE) + WIDE),
+    "conv, a sum and two functions": lambda x: F.gelu(F.relu(CONV(x) + CONV(x + x))),
+    "conv that is read after its sum": lambda x: F.gelu((y := CONV(x)) + WIDE) + y,
     "convs": lambda x: (y := F.gelu(CONV(x))) + F.gelu(CONV2(y)),
     "conv of two": lambda x: CONV(torch.cat((x[:, 1:], x[:, :1]), 1)),
     "resized": lambda x: F.interpolate(x, (7, 3), mode="bilinear"),
@@ -109,6 +117,36 @@ def test_a_program_computes_what_its_function_computes(name, for_file, batch):
     for got, want in pairs:
         torch.testing.assert_close(got, want)
         assert not for_file or got.is_contiguous()
+
+
+@torch.no_grad()
+@settings(max_examples=150, deadline=None)
+@given(
+    batch=st.integers(1, 3), height=st.integers(1, 9) | st.integers(60, 70),
+    width=st.integers(1, 9) | st.integers(60, 70) | st.integers(126, 131),
+    channels=st.integers(1, 5) | st.integers(14, 15) | st.integers(42, 44),
+    columns=st.integers(1, 5) | st.integers(47, 49) | st.integers(96, 98),
+    one_for_all=st.booleans(), threads=st.integers(1, 3), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_convolutions_of_any_size(
+    batch, height, width, channels, columns, one_for_all, threads, seed
+):
+    torch.manual_seed(seed)
+    conv = nn.Conv2d(channels, columns, 3, padding=1)
+    x = torch.randn(batch, channels, height, width)
+    summand = torch.randn(1 if one_for_all else batch, columns, height, width)
+
+    def forward(x, _, more):
+        return F.relu(conv(x) + (summand if more is None else more))
+
+    images, before = (x,) if one_for_all else (x, summand), torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        found = run(forward, *images, for_file=True)
+    finally:
+        torch.set_num_threads(before)
+    conv.double()
+    torch.testing.assert_close(found, forward(x.double(), None, summand).float())
 
 
 @torch.no_grad()

@@ -32,6 +32,17 @@ inline Doubles whole_part(Doubles x) {
 
 inline void stream_lanes(float* to, Floats v) { _mm256_stream_ps(to, (__m256)v); }
 
+inline __m256i first_lanes(int64_t count) {
+  const Vector<int32_t, 8> lanes = {0, 1, 2, 3, 4, 5, 6, 7};
+  return (__m256i)(lanes < static_cast<int32_t>(count));
+}
+inline Floats load_first(const float* from, int64_t count) {
+  return (Floats)_mm256_maskload_ps(from, first_lanes(count));
+}
+inline void store_first(float* to, Floats v, int64_t count) {
+  _mm256_maskstore_ps(to, first_lanes(count), (__m256)v);
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   const auto bits = (Vector<uint32_t, 8>)_mm256_cvtepu16_epi32(load_bits<__m128i>(from));
   return (Floats)(bits << 16);

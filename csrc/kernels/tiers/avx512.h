@@ -38,6 +38,14 @@ inline Doubles whole_part(Doubles x) {
 
 inline void stream_lanes(float* to, Floats v) { _mm512_stream_ps(to, (__m512)v); }
 
+inline __mmask16 first_lanes(int64_t count) { return static_cast<__mmask16>((1 << count) - 1); }
+inline Floats load_first(const float* from, int64_t count) {
+  return (Floats)_mm512_maskz_loadu_ps(first_lanes(count), from);
+}
+inline void store_first(float* to, Floats v, int64_t count) {
+  _mm512_mask_storeu_ps(to, first_lanes(count), (__m512)v);
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   const __m256i halves = load_bits<__m256i>(from);
   return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);

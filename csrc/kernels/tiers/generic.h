@@ -40,6 +40,16 @@ inline Doubles whole_part(Doubles x) {
   return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, 2>), Doubles);
 }
 
+// Load and store the first lanes of a register, 0 to all of them. The other lanes are 0.
+inline Floats load_first(const float* from, int64_t count) {
+  Floats v{};
+  for (int64_t lane = 0; lane < count; ++lane) v[lane] = from[lane];
+  return v;
+}
+inline void store_first(float* to, Floats v, int64_t count) {
+  for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
+}
+
 // Widens bfloat16 to float32: the bits become the upper half of each float.
 inline Floats widen_lanes(const bfloat16* from) {
   using Bits = Vector<uint32_t, 4>;

@@ -36,6 +36,15 @@ inline Vector<int32_t, 2> to_ints(Doubles x) {
 
 inline Doubles whole_part(Doubles x) { return (Doubles)vrndq_f64((float64x2_t)x); }
 
+inline Floats load_first(const float* from, int64_t count) {
+  Floats v{};
+  for (int64_t lane = 0; lane < count; ++lane) v[lane] = from[lane];
+  return v;
+}
+inline void store_first(float* to, Floats v, int64_t count) {
+  for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)vshll_n_u16(load_bits<uint16x4_t>(from), 16);
 }
