@@ -79,14 +79,15 @@ class Forward {
   void single(const T* map, int64_t count, T* to) const {
     using Pixels = Vector<Real, kLanes<Real>>;
     const int64_t whole = round_up(count, kLanes<Real>);
-    Real corners[4][kTile];
-    for (int corner = 0; corner < 4; ++corner) {
-      for (int64_t k = 0; k < whole; ++k) {
-        corners[corner][k] = load<Real>(map + tile->token[corner][k]);
-      }
-    }
     const auto product = [&](int corner, int64_t k) {
-      return load<Pixels>(tile->weight[corner] + k) * load<Pixels>(corners[corner] + k);
+      const auto* at = tile->token[corner] + k;
+      Pixels values;
+      if constexpr (is_same_v<T, float>) {
+        values = gathered(map, at);
+      } else {
+        for (int lane = 0; lane < kLanes<Real>; ++lane) values[lane] = load<Real>(map + at[lane]);
+      }
+      return load<Pixels>(tile->weight[corner] + k) * values;
     };
     Real out[kTile];
     for (int64_t k = 0; k < whole; k += kLanes<Real>) {

@@ -43,6 +43,10 @@ inline void store_first(float* to, Floats v, int64_t count) {
   _mm256_maskstore_ps(to, first_lanes(count), (__m256)v);
 }
 
+inline Floats gathered(const float* from, const int32_t* at) {
+  return (Floats)_mm256_i32gather_ps(from, load_bits<__m256i>(at), sizeof(float));
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   const auto bits = (Vector<uint32_t, 8>)_mm256_cvtepu16_epi32(load_bits<__m128i>(from));
   return (Floats)(bits << 16);

@@ -46,6 +46,11 @@ inline void store_first(float* to, Floats v, int64_t count) {
   _mm512_mask_storeu_ps(to, first_lanes(count), (__m512)v);
 }
 
+inline Floats gathered(const float* from, const int32_t* at) {
+  const __m512i index = load_bits<__m512i>(at);
+  return (Floats)_mm512_mask_i32gather_ps(_mm512_setzero_ps(), 0xFFFF, index, from, sizeof(float));
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   const __m256i halves = load_bits<__m256i>(from);
   return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);

@@ -50,6 +50,11 @@ inline void store_first(float* to, Floats v, int64_t count) {
   for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
 }
 
+// Joins the floats at from[at[0]], from[at[1]], ...
+inline Floats gathered(const float* from, const int32_t* at) {
+  return Floats{from[at[0]], from[at[1]], from[at[2]], from[at[3]]};
+}
+
 // Widens bfloat16 to float32: the bits become the upper half of each float.
 inline Floats widen_lanes(const bfloat16* from) {
   using Bits = Vector<uint32_t, 4>;

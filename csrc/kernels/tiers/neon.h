@@ -45,6 +45,10 @@ inline void store_first(float* to, Floats v, int64_t count) {
   for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
 }
 
+inline Floats gathered(const float* from, const int32_t* at) {
+  return Floats{from[at[0]], from[at[1]], from[at[2]], from[at[3]]};
+}
+
 inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)vshll_n_u16(load_bits<uint16x4_t>(from), 16);
 }
