@@ -51,7 +51,7 @@ MODELS = {
     "darswin_a_nano": (64, {ONNX_RUNTIME: 1.3, AOTI: 1.0}),
     "darswin_a_micro": (64, {ONNX_RUNTIME: 1.1}),
     "darswin_a_small": (64, {ONNX_RUNTIME: 1.1}),
-    "darswin_unet_a_nano": (128, {ONNX_RUNTIME: 1.5}),
+    "darswin_unet_ra_nano": (128, {ONNX_RUNTIME: 1.9}),
     "conv_unet_nano": (128, {ONNX_RUNTIME: 1.0}),
 }
 # The least ratios of a sampler and ONNX Runtime to `darswin.frames.Network`, on one thread.

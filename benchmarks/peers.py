@@ -28,6 +28,8 @@ from kit.timing import DEFAULT, MATMULS, OURS, REFERENCE, Case, Timing, measure
 from torch import Tensor
 from tqdm import tqdm
 
+from darswin import list_models
+
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
 T = TypeVar("T")
@@ -160,13 +162,18 @@ def run_suite(
 
 def draw_peers(record: Record, path: Path) -> None:
     """Draws the peers' times over ours at one thread: a panel for each operator and mode, with a
-    row for each case."""
+    row for each case; of several models, a panel for each mode, with a row for each model."""
     found: dict[str, dict[str, Rows]] = {}
+    of_models = all(t.subject in list_models() for t in record.timings)
     for t in record.timings:
         if t.threads == 1 and not t.name.startswith(OURS):
-            operator = t.subject.partition(",")[0]
-            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 20)}", {})
-            rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
+            group, title, row = (
+                (t.mode, fill(t.mode, 40), t.subject)
+                if of_models
+                else (t.subject.partition(",")[0], f"{t.subject}\n{fill(t.mode, 20)}", t.setting)
+            )
+            rows = found.setdefault(group, {}).setdefault(title, {})
+            rows.setdefault(f"{row}, batch {t.batch}", {})[t.name] = t.ratio
     lines = [line for panels in found.values() for line in in_lines(panels)]
     names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
     unit = "time of the peer / time of darswin, 1 thread"
