@@ -93,7 +93,7 @@ class Programs:
         known = self._known[key]
         inputs: Sequence[Tensor]
         if known.fields is not None:
-            inputs = [leaves[k].detach().float() for k in known.fields]
+            inputs = [leaves[k].detach().float().contiguous() for k in known.fields]
         else:
             count = max((len(one) for one in leaves if isinstance(one, Tensor)), default=1)
             each = [self._trace(_of_lens(read, k), shapes).given for k in range(count)]

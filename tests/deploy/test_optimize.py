@@ -81,6 +81,18 @@ def test_a_fixed_lens_is_prepared_once_for_each_size(name, monkeypatch):
         fixed(frames[0], lens)
 
 
+@pytest.mark.parametrize("name", ["conv_unet_nano", "darswin_unet_ra_nano", "swin_nano"])
+def test_a_frame_copies_nothing_by_torch(name):
+    """Threads of torch would stay awake behind a copy, beside those of the program."""
+    model, images = network(name), torch.randn(1, 3, 32, 32)
+    fast = optimize(model, lens=Spherical.from_fov(0.5, 2.5, 16))
+    fast(images)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        fast(images)
+    names = {event.key for event in profile.key_averages()}
+    assert "aten::permute" in names and not names & {"aten::copy_", "aten::clone"}
+
+
 def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():
     camera = LENSES[:1].replace(image_size=torch.tensor([[32.0, 32.0]]))
     fast = optimize(network("darswin_a_nano"), lens=camera)
