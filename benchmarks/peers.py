@@ -230,7 +230,7 @@ def camera_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     paced = any(t.paced for t in frames)
     threads = DEFAULT if paced else max(t.threads for t in frames)
     return pivot(
-        f"one frame {'every 33 ms' if paced else 'in a loop'}: p50 (p99)",
+        f"a frame {'every 33 ms' if paced else 'in a loop'}: p50 (p99)",
         (
             (t.name, f"`{t.subject}`", f"{1e3 * t.median:.2f} ({1e3 * (t.p99 or 0):.2f})")
             for t in frames

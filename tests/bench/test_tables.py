@@ -62,7 +62,7 @@ def test_frames_of_a_camera(camera):
         f"| `darswin_a_nano`, 64×64, float32 | 1.00{BOTH}0.90 | 2.00{BOTH}2.00 |"
     ]
     assert peers.camera_table(camera, ["peer"]).splitlines() == [
-        "| one frame every 33 ms: p50 (p99) | `darswin_a_nano` |",
+        "| a frame every 33 ms: p50 (p99) | `darswin_a_nano` |",
         "|---|---|",
         "| darswin | 1.50 (1.30) |",
         "| peer | 2.00 (2500.00) |",
@@ -76,7 +76,7 @@ def test_records_of_loops_alone_have_tables_too(camera):
         "| `darswin_a_small`, 64×64, float32 | 0.40 | 0.50 |"
     ]
     assert peers.camera_table(loops, ["peer"]).splitlines() == [
-        "| one frame in a loop: p50 (p99) | `darswin_a_small` |",
+        "| a frame in a loop: p50 (p99) | `darswin_a_small` |",
         "|---|---|",
         "| darswin | 0.40 (0.80) |",
         "| peer | 0.50 (1.00) |",
