@@ -29,7 +29,8 @@ demo: build  ## train on nearly undistorted digits, test through fisheye lenses,
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
 # The tests of what is compiled: other tiers, compilers and sanitizers run them too.
-COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/deploy/test_contract.py
+COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/deploy/test_contract.py \
+  $(ROOT)/tests/deploy/test_record.py
 PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
 test: build  ## run the fast tests: values, gradients, errors
