@@ -164,7 +164,7 @@ def draw_peers(record: Record, path: Path) -> None:
     """Draws the peers' times over ours at one thread: a panel for each operator and mode, with a
     row for each case; of several models, a panel for each mode, with a row for each model."""
     found: dict[str, dict[str, Rows]] = {}
-    of_models = all(t.subject in list_models() for t in record.timings)
+    of_models = {t.subject for t in record.timings} <= {*list_models()}
     for t in record.timings:
         if t.threads == 1 and not t.name.startswith(OURS):
             group, title, row = (

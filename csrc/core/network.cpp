@@ -206,19 +206,20 @@ Block Network::block_of(const int64_t* a, bool deforms) const {
   return block;
 }
 
-// Appends a step. A convolution does what follows it while its result is in the cache: a sum, and
-// then a function.
+// Appends a step. A convolution does what follows it while its result is in the cache: a function,
+// a sum, and a function of that.
 void Network::append(Step step) {
   const int64_t* a = step.arguments;
-  Step* const before = steps.empty() ? nullptr : &steps.back();
-  if (before != nullptr && before->opcode == Opcode::conv && before->then == After::nothing) {
-    const int64_t out = before->arguments[1];
-    if (step.opcode == Opcode::add && a[1] == out && before->summand < 0) {
-      before->summand = a[0];
+  if (!steps.empty() && steps.back().opcode == Opcode::conv) {
+    Step& conv = steps.back();
+    const int64_t out = conv.arguments[1];
+    After& function = conv.summand < 0 ? conv.after : conv.then;
+    if (step.opcode == Opcode::apply && a[0] == out && function == After::nothing) {
+      function = static_cast<After>(a[1]);
       return;
     }
-    if (step.opcode == Opcode::apply && a[0] == out && before->summand >= 0) {
-      before->then = static_cast<After>(a[1]);
+    if (step.opcode == Opcode::add && a[1] == out && conv.summand < 0) {
+      conv.summand = a[0];
       return;
     }
   }
@@ -295,6 +296,7 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       fits(a[1], {a[2], a[3], a[5]}, true);
       step.layer = layer_at(a[6], product({a[4], 9}), a[5], 0);
       require(a[7] == 0 || follows(a[7]), "has an unknown function");
+      step.after = static_cast<After>(a[7]);
       break;
     case Opcode::pool:
       apart();

@@ -79,9 +79,9 @@ class Network {
     Norm norm{};
     Layer layer{};
     Block block{};
-    // A convolution adds this slot, if any, and applies a function to the sum.
+    // A convolution applies a function, adds this slot, if any, and applies a function to the sum.
+    After after = After::nothing, then = After::nothing;
     int64_t summand = -1;
-    After then = After::nothing;
 
     bool is_block() const { return opcode == Opcode::block || opcode == Opcode::deform; }
   };

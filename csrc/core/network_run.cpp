@@ -57,9 +57,9 @@ struct Network::Run {
     const int64_t first = network.input_count();
     return slot < first ? network.inputs[slot] : network.buffers[slot - first];
   }
-  const float* image(int64_t slot, int64_t b) const {
-    return from[slot] + (rows[slot] == 1 ? 0 : b * numbers(slot));
-  }
+  // The numbers from one image to the next.
+  int64_t stride(int64_t slot) const { return rows[slot] == 1 ? 0 : numbers(slot); }
+  const float* image(int64_t slot, int64_t b) const { return from[slot] + b * stride(slot); }
   float* result(int64_t slot, int64_t b) const { return to[slot] + b * numbers(slot); }
   // The numbers of a slot, with a row for each image.
   const float* all(int64_t slot) const {
@@ -176,19 +176,18 @@ struct Network::Run {
 
   void conv(const Step& step) const {
     const int64_t* a = step.arguments;
-    Convolution{
-        .x = from[a[0]],
-        .stride = rows[a[0]] == 1 ? 0 : numbers(a[0]),
-        .batch = batch,
-        .height = a[2],
-        .width = a[3],
-        .channels = a[4],
-        .layer = step.layer,
-        .after = static_cast<After>(a[7]),
-        .summand = step.summand < 0 ? nullptr : from[step.summand],
-        .summand_stride = step.summand < 0 || rows[step.summand] == 1 ? 0 : numbers(step.summand),
-        .then = step.then,
-        .out = to[a[1]]}
+    Convolution{.x = from[a[0]],
+                .stride = stride(a[0]),
+                .batch = batch,
+                .height = a[2],
+                .width = a[3],
+                .channels = a[4],
+                .layer = step.layer,
+                .after = step.after,
+                .summand = step.summand < 0 ? nullptr : from[step.summand],
+                .summand_stride = step.summand < 0 ? 0 : stride(step.summand),
+                .then = step.then,
+                .out = to[a[1]]}
         .run();
   }
 

@@ -2,7 +2,6 @@
 
 import struct
 import weakref
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -183,37 +182,24 @@ class Program:
         """The steps, of which those with a `base` change it in place or a copy of it; and the
         buffer whose memory a buffer takes."""
         last = {slot.key: k for k, step in enumerate(self._steps) for slot in step.reads}
-        readers = Counter(slot.key for step in self._steps for slot in step.reads)
         last |= {slot.key: len(self._steps) for slot in self._outputs}
         steps: list[Step] = []
         place: dict[tuple[bool, int], tuple[bool, int]] = {}
-        made: dict[tuple[bool, int], Step] = {}
-        for k, step in enumerate(map(replace, self._steps)):  # copies, which may change
+        for k, step in enumerate(self._steps):
             base, free = step.base, step.base is not None and last[step.base.key] == k
             if step.opcode == ADD:
                 base, other = step.reads
-                # A convolution adds to its result while that is in the cache.
-                maker = made.get(other.key)
-                of_conv = maker is not None and maker.opcode == CONV and last[other.key] == k
-                if of_conv or not (base.is_buffer and free):  # then perhaps the other summand
+                # What the last step wrote is still in the cache: a convolution adds to its result.
+                is_newest = k > 0 and self._steps[k - 1].out.key == other.key
+                if (is_newest and last[other.key] == k) or not (base.is_buffer and free):
                     base, other = other, base
                 free = last[base.key] == k and base.key != other.key
                 step = replace(step, base=base, arguments=(other, step.out))
             if base is not None and base.is_buffer and free:
                 place[step.out.key] = place.get(base.key, base.key)
-                before = made.get(base.key) if readers[base.key] == 1 else None
-                is_plain_conv = (
-                    before is not None and before.opcode == CONV and before.arguments[-1] == NOTHING
-                )
-                if step.opcode == APPLY and is_plain_conv:
-                    assert before is not None
-                    before.arguments = (*before.arguments[:-1], step.arguments[-1])
-                    made[step.out.key] = before
-                    continue
             elif base is not None and step.opcode != NORM:
                 steps.append(_copy(base, step.out, [(base.numbers, 1, 1)]))
             steps.append(step)
-            made[step.out.key] = step
         return steps, place
 
     def _step(

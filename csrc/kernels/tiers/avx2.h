@@ -1,4 +1,5 @@
-// AVX2: registers of 256 bits, and fused multiply-add. generic.h explains each name.
+// AVX2: registers of 256 bits, and fused multiply-add. generic.h and four_lanes.h
+// explain each name.
 #pragma once
 
 #include <immintrin.h>

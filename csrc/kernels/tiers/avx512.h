@@ -1,5 +1,5 @@
-// AVX-512 (F, BW, VL, DQ): registers of 512 bits, and fused multiply-add. generic.h explains each
-// name.
+// AVX-512 (F, BW, VL, DQ): registers of 512 bits, and fused multiply-add. generic.h and
+// four_lanes.h explain each name.
 #pragma once
 
 #include <immintrin.h>

@@ -11,22 +11,15 @@
 
 #include "../../numbers.h"
 #include "../vector.h"
+#include "four_lanes.h"
 
 namespace darswin {
 namespace {
 
-constexpr int kRegister = 16;  // bytes
-constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
+constexpr int kTileRows = 4;  // rows of a tile of sums: 4 x 3 of 16 registers
 constexpr bool kFused = false;
 // There is add_fours, and it takes signed bytes: those of tokens less 128.
 constexpr bool kHasFours = false, kSignedFours = false, kHasTiles = false;
-
-using Floats = Vector<float, 4>;
-using Doubles = Vector<double, 2>;
-using Words = Vector<uint64_t, 2>;
-
-// Repeats four lanes in every 128 bits of a register.
-inline Floats repeat(Vector<float, 4> v) { return v; }
 
 inline Doubles to_doubles(Vector<int32_t, 2> x) { return __builtin_convertvector(x, Doubles); }
 
@@ -38,21 +31,6 @@ inline Vector<int32_t, 2> to_ints(Doubles x) {
 // Returns the whole part of numbers below 2^63.
 inline Doubles whole_part(Doubles x) {
   return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, 2>), Doubles);
-}
-
-// Load and store the first lanes of a register, 0 to all of them. The other lanes are 0.
-inline Floats load_first(const float* from, int64_t count) {
-  Floats v{};
-  for (int64_t lane = 0; lane < count; ++lane) v[lane] = from[lane];
-  return v;
-}
-inline void store_first(float* to, Floats v, int64_t count) {
-  for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
-}
-
-// Joins the floats at from[at[0]], from[at[1]], ...
-inline Floats gathered(const float* from, const int32_t* at) {
-  return Floats{from[at[0]], from[at[1]], from[at[2]], from[at[3]]};
 }
 
 // Widens bfloat16 to float32: the bits become the upper half of each float.

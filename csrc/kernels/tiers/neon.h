@@ -1,17 +1,17 @@
 // NEON, which every CPU of the 64-bit ARM architecture has: 32 registers of 128 bits, and fused
-// multiply-add. generic.h explains each name.
+// multiply-add. generic.h and four_lanes.h explain each name.
 #pragma once
 
 #include <arm_neon.h>
 
 #include "../../numbers.h"
 #include "../vector.h"
+#include "four_lanes.h"
 
 namespace darswin {
 namespace {
 
-constexpr int kRegister = 16;  // bytes
-constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
+constexpr int kTileRows = 8;  // rows of a tile of sums: 8 x 3 of 32 registers
 constexpr bool kFused = true;
 #if defined(__clang__) && !defined(__ARM_FEATURE_DOTPROD)
 // Clang assembles no instruction that its target lacks. Apple's targets have this one.
@@ -19,12 +19,6 @@ constexpr bool kHasFours = false, kSignedFours = false, kHasTiles = false;
 #else
 constexpr bool kHasFours = true, kSignedFours = true, kHasTiles = false;
 #endif
-
-using Floats = Vector<float, 4>;
-using Doubles = Vector<double, 2>;
-using Words = Vector<uint64_t, 2>;
-
-inline Floats repeat(Vector<float, 4> v) { return v; }
 
 inline Doubles to_doubles(Vector<int32_t, 2> x) {
   return (Doubles)vcvtq_f64_s64(vmovl_s32((int32x2_t)x));
@@ -35,19 +29,6 @@ inline Vector<int32_t, 2> to_ints(Doubles x) {
 }
 
 inline Doubles whole_part(Doubles x) { return (Doubles)vrndq_f64((float64x2_t)x); }
-
-inline Floats load_first(const float* from, int64_t count) {
-  Floats v{};
-  for (int64_t lane = 0; lane < count; ++lane) v[lane] = from[lane];
-  return v;
-}
-inline void store_first(float* to, Floats v, int64_t count) {
-  for (int64_t lane = 0; lane < count; ++lane) to[lane] = v[lane];
-}
-
-inline Floats gathered(const float* from, const int32_t* at) {
-  return Floats{from[at[0]], from[at[1]], from[at[2]], from[at[3]]};
-}
 
 inline Floats widen_lanes(const bfloat16* from) {
   return (Floats)vshll_n_u16(load_bits<uint16x4_t>(from), 16);
