@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from allpairspy import AllPairs
 from safetensors.torch import load_file
 
 from darswin import create_model
@@ -14,7 +15,7 @@ from darswin.compat import OfficialDarSwin, OfficialPolynomial
 from darswin.lens import Mei, Polynomial, Spherical
 from darswin.models.registry import has_image_size
 
-slow = pytest.mark.slow
+slow, products = pytest.mark.slow, pytest.mark.products
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 
 
@@ -27,13 +28,17 @@ def changed(name: str, old: str, new: str) -> str:
 
 def product(*tables):
     """The rows of a product of tables, for `parametrize`: a few have each value of each table once,
-    and the others are slow."""
+    those that give each pair of values of two tables are slow, and the others are left to `make
+    test-products`."""
     tables = [list(table) for table in tables]
-    longest = max(map(len, tables))
-    fast = {tuple(k % len(table) for table in tables) for k in range(longest)}
+    places = [range(len(table)) for table in tables]
+    fast = {tuple(k % len(table) for table in tables) for k in range(max(map(len, tables)))}
+    # The fast rows have their pairs already.
+    pairs = {*map(tuple, AllPairs(places, previously_tested=sorted(map(list, fast))))}
+    marks = {row: slow for row in pairs} | {row: [] for row in fast}
     return [
-        pytest.param(*map(list.__getitem__, tables, row), marks=[] if row in fast else slow)
-        for row in itertools.product(*(range(len(table)) for table in tables))
+        pytest.param(*map(list.__getitem__, tables, row), marks=marks.get(row, [slow, products]))
+        for row in itertools.product(*places)
     ]
 
 
