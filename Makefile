@@ -28,10 +28,15 @@ demo: build  ## train on nearly undistorted digits, test through fisheye lenses,
 	$(BIN)/python examples/digits.py
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
-# The tests of what is compiled: other tiers, compilers and sanitizers run them too.
-COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/deploy/test_contract.py \
-  $(ROOT)/tests/deploy/test_record.py
 PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
+
+# The tests of what is compiled, which other compilers and sanitizers run too, and among them those of
+# the kernels, which differ from tier to tier.
+KERNELS := $(addprefix $(ROOT)/tests/,$(foreach name,blocks contract gathers inference polar_sample \
+  polar_to_image properties quantized_blocks window_attention,ops/test_$(name).py) \
+  frames/test_frames.py deploy/test_contract.py)
+COMPILED := $(addprefix $(ROOT)/tests/,ops frames deploy/test_contract.py deploy/test_record.py)
+TIERS = $$($(ROOT)/$(BIN)/python -c 'from darswin.ops import _module; print(*reversed(_module.tiers()))')
 
 test: build  ## run the fast tests: values, gradients, errors
 	$(PYTEST) -m "not slow"
@@ -45,15 +50,20 @@ avx2 := ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 MKL_CBWR=COMPATIBLE
 scalar := ATEN_CPU_CAPABILITY=default ONEDNN_MAX_CPU_ISA=AVX512_CORE
 vnni := ONEDNN_MAX_CPU_ISA=AVX512_CORE_VNNI MKL_CBWR=AVX2
 rounding := DARSWIN_TEST_ROUNDING=1
+# Where numbers meet those of other libraries.
+NUMBERS := $(addprefix tests/,boxes calibrate deploy frames layers lens models ops views)
 SEED := $(shell date +%s)
 
-test-numerics: $(NUMERICS:%=test-numerics-%)  ## run the fast tests in a random order as other CPUs round; NUMERICS=avx2 is one setting
+test-numerics: $(NUMERICS:%=test-numerics-%)  ## run the fast tests of numbers in a random order as other CPUs round; NUMERICS=avx2 is one setting
 test-numerics-%: build
 	mkdir -p "build/tests of $*"
-	$($*) TMPDIR=$(ROOT)/build/tests\ of\ $* DARSWIN_TEST_SEED=$(SEED) $(PYTEST) -q -m "not slow"
+	$($*) TMPDIR=$(ROOT)/build/tests\ of\ $* DARSWIN_TEST_SEED=$(SEED) $(PYTEST) -q -m "not slow" $(NUMBERS)
 
 test-all: build  ## run all tests, also those that compile graphs, start processes, train or run the docs
-	$(PYTEST)
+	$(PYTEST) -m "not products"
+
+test-products: build  ## run the rows of large tables of tests that `make test-all` leaves out (N minutes)
+	$(PYTEST) -m products
 
 # All requirements in pyproject.toml except torch, at their lowest versions.
 LOWEST := .venv-lowest
@@ -70,7 +80,7 @@ test-lowest: build $(LOWEST)/installed  ## test the commands, files, pictures an
 	  tests/deploy/test_export.py -k "not program and not package"
 
 test-isa: build  ## test the operators on every instruction-set tier of this machine
-	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
+	@set -e; for tier in $(TIERS); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q $(COMPILED) \
@@ -82,21 +92,20 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 SANITIZED := build/sanitized
 PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=libstdc++.so)
 SANITIZER = LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
-	    UBSAN_OPTIONS=print_stacktrace=1
+	    UBSAN_OPTIONS=print_stacktrace=1 DARSWIN_TEST_THREADS=1,2,3,7
 
 sanitized: build
 	@rm -rf $(SANITIZED)/darswin
 	@PATH=$(ROOT)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined DARSWIN_BUILD=cmake-sanitized \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
 
-test-asan: sanitized  ## test the operators on every tier with AddressSanitizer and UBSan
-	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
-	cd $(SANITIZED); for tier in $$tiers; do \
-	  echo "== $$tier, sanitized"; \
+test-asan: sanitized  ## test what is compiled on the best tier, and the kernels on the others, with AddressSanitizer and UBSan
+	@set -e; run() { tier=$$1; shift; echo "== $$tier, sanitized"; \
 	  $(SANITIZER) ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
-	      -m "not unsanitized" $(COMPILED); \
-	done
+	      -m "not unsanitized and not slow" "$$@"; }; \
+	set -- $(TIERS); cd $(SANITIZED); run $$1 $(COMPILED); shift; \
+	for tier; do run $$tier $(KERNELS); done
 
 # The modules of another compiler, in the same way. Needs `apt-get install clang-16`.
 CLANG := build/clang
