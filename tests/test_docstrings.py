@@ -28,7 +28,7 @@ def public_names() -> dict[str, object]:
 
 
 def undocumented() -> Iterator[str]:
-    methods = property | cached_property | classmethod | staticmethod
+    methods = property | cached_property
     for path, value in public_names().items():
         if inspect.isfunction(value) and not value.__doc__:
             yield path
@@ -38,10 +38,10 @@ def undocumented() -> Iterator[str]:
         if not vars(value).get("__doc__") or value.__doc__.startswith(f"{value.__name__}("):
             yield path
         for name, member in vars(value).items():
-            known = inspect.isfunction(member) or inspect.isclass(member)
-            if not name.startswith("_") and (known or isinstance(member, methods)):
-                if not inspect.getdoc(getattr(value, name)):  # also that of a base class
-                    yield f"{path}.{name}"
+            known = inspect.isroutine(member) or inspect.isclass(member)
+            public = not name.startswith("_") and (known or isinstance(member, methods))
+            if public and not inspect.getdoc(getattr(value, name)):  # also that of a base class
+                yield f"{path}.{name}"
 
 
 def test_every_module_has_a_docstring():
