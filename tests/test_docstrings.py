@@ -4,7 +4,6 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Iterator
-from functools import cached_property
 
 import darswin
 
@@ -28,7 +27,6 @@ def public_names() -> dict[str, object]:
 
 
 def undocumented() -> Iterator[str]:
-    methods = property | cached_property
     for path, value in public_names().items():
         if inspect.isfunction(value) and not value.__doc__:
             yield path
@@ -39,7 +37,7 @@ def undocumented() -> Iterator[str]:
             yield path
         for name, member in vars(value).items():
             known = inspect.isroutine(member) or inspect.isclass(member)
-            public = not name.startswith("_") and (known or isinstance(member, methods))
+            public = not name.startswith("_") and (known or isinstance(member, property))
             if public and not inspect.getdoc(getattr(value, name)):  # also that of a base class
                 yield f"{path}.{name}"
 
