@@ -2,14 +2,12 @@
 
 import itertools
 import sys
-from importlib.metadata import PackageNotFoundError
 
-import cv2
 import model
 import peers
 import pytest
 import torch
-from kit import candidates, machine, memory, start, tables, timing
+from kit import candidates, memory, start, tables, timing
 from kit.record import Record
 from kit.start import Start
 from kit.timing import (
@@ -251,18 +249,3 @@ def test_a_program_tells_its_time_and_memory():
         RuntimeError, match=r"start of a runtime cannot be measured(.|\n)*no_module"
     ):
         start.measure("model", "a runtime", "import no_module")
-
-
-def test_the_record_names_the_versions_of_the_peers_that_are_there(monkeypatch):
-    head = machine.machine()
-    assert head["torch"] == torch.__version__
-    opencv = [head[name] for name in machine.PACKAGES if name.startswith("opencv") and name in head]
-    assert opencv and all(found.startswith(cv2.__version__) for found in opencv)
-
-    def version(name):
-        if name == "openvino":
-            raise PackageNotFoundError(name)
-        return "1.2"
-
-    monkeypatch.setattr(machine, "version", version)
-    assert set(machine.PACKAGES) - machine.machine().keys() == {"openvino"}

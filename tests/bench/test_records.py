@@ -141,38 +141,15 @@ def test_tables_and_targets_of_frames(camera):
     ]
 
 
-def drawn(monkeypatch, draw, record):
-    """The figure that is drawn of a record."""
-    figures = []
-    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
-    draw(record, Path("picture.png"))
-    return figures[-1]
-
-
-def test_pictures_show_the_numbers(record, operators, monkeypatch):
-    dots = {
-        axes.get_title(): {
-            line.get_label(): dict(zip(line.get_ydata(), line.get_xdata(), strict=True))
-            for line in axes.lines
-            if not line.get_label().startswith("_")
-        }
-        for draw, of in ((plot.draw_models, record), (peers.draw_peers, Record({}, operators)))
-        for axes in drawn(monkeypatch, draw, of).axes
-    }
-    inference = dots["inference, float32"]
-    assert inference["darswin"] == pytest.approx({0: 80, 1: 50})
-    assert inference["matrix products alone"] == pytest.approx({0: 8 / 0.09})
-    assert dots["training, float32"] == {"darswin": pytest.approx({0: 8 / 0.3})}
-    assert dots["polar_sample\nforward"] == {"slow": {0: 5.0}, "fast": {0: 1.5}}
-    assert dots["another\nforward"] == {"peer": {0: 1.0}}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("picture", sorted(RESULTS.glob("*.png")), ids=lambda path: path.stem)
 def test_the_pictures_of_the_records_can_be_read(picture, monkeypatch):
     """The text is large enough, the page is not endless, and the text lies inside."""
+    figures = []
+    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
     draw = plot.draw_models if picture.stem.startswith("model") else peers.draw_peers
-    figure = drawn(monkeypatch, draw, Record.load(picture.with_suffix(".json")))
+    draw(Record.load(picture.with_suffix(".json")), picture)
+    (figure,) = figures
     width, height = figure.get_size_inches()
     assert on_a_phone(figure) >= 9 and height <= 2.5 * width
     names = [name for axes in figure.axes for name in (axes.title, *axes.get_yticklabels())]

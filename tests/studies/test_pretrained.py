@@ -1,5 +1,4 @@
-"""The study of pretrained detectors: what is decoded, its scenes, and the whole on made-up
-photographs with a made-up detector."""
+"""The study of pretrained detectors: its scenes, and the whole with a made-up detector."""
 
 import json
 import math
@@ -8,10 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnxruntime
 import pretrained
 import pretrained_crops
-import pretrained_graphs
 import pretrained_methods
 import pretrained_people
 import pretrained_scenes
@@ -21,67 +18,9 @@ import pytest
 import torch
 from helpers import in_this_process
 from pretrained_files import CLASSIFIER, MODELS, PANORAMAS, STAMPS, VIDEO, Files
-from pretrained_graphs import DETECTORS, FOUND, export
-from pretrained_methods import Look, slices, tiles
-from pretrained_scenes import CLASSES, SIZE, SPLITS, Scene
+from pretrained_methods import slices
+from pretrained_scenes import CLASSES, SPLITS, Scene
 from torch import nn
-
-from darswin import boxes
-
-
-class Outputs(nn.Module):
-    """In place of a graph: what it gives for any image of 64 × 96 pixels."""
-
-    def __init__(self, outputs: list[torch.Tensor]) -> None:
-        super().__init__()
-        self.outputs = outputs
-
-    def forward(self, image):
-        return [of + 0 * image.sum() for of in self.outputs]
-
-
-def one_thing(name: str) -> tuple[list[torch.Tensor], list[float]]:
-    """The outputs of a network that finds a thing of the class 7 in two cells, of which the second
-    is worse; and the box of the first, 3 cells to the right."""
-    if name == "CenterNet":
-        heat, sides = torch.zeros(1, 16, 24, 80), torch.zeros(1, 16, 24, 4)
-        heat[0, 2, 3, 7], heat[0, 3, 4, 7] = 0.9, 0.8
-        sides[0, 2, 3] = torch.tensor([5.0, 6, 7, 8])
-        return [heat, sides], [12 - 5, 8 - 6, 12 + 7, 8 + 8]
-    scores, spreads = (
-        [torch.zeros(1, count, 64 // stride, 96 // stride) for stride in (8, 16, 32)]
-        for count in (80, 44)
-    )
-    scores[1][0, 7, 1, 3], scores[1][0, 7, 2, 3] = 0.9, 0.8
-    spreads[1][0, [1, 11 + 2, 22 + 3, 33 + 4], 1:3, 3] = 100  # distances of 1, 2, 3 and 4 cells
-    return scores + spreads, [56 - 16, 24 - 32, 56 + 48, 24 + 64]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DETECTORS)
-def test_decoding_is_in_the_graph_of_the_network(tmp_path, monkeypatch, name):
-    outputs, box = one_thing(name)
-    monkeypatch.setattr(pretrained_graphs, "Graph", lambda *_: Outputs(outputs))
-    network, images = DETECTORS[name](tmp_path).eval(), torch.zeros(1, 3, 64, 96)
-    boxes_found, scores, labels = (of[0] for of in network(images))
-    assert boxes_found[0].tolist() == pytest.approx(box, abs=1e-3) and labels[0] == 7
-    assert scores.tolist() == pytest.approx([0.9] + [0] * (FOUND - 1))
-    network.body = Outputs([torch.rand(of.shape) for of in outputs])
-    export(network, (64, 96), tmp_path / "detector.onnx")
-    session = onnxruntime.InferenceSession(str(tmp_path / "detector.onnx"))
-    assert [of.name for of in session.get_outputs()] == ["boxes", "scores", "labels"]
-    exported = session.run(None, {"images": images.numpy()})
-    kept = exported[1] > 0  # detections without a score have no order
-    for found, expected in zip(exported, network(images), strict=True):
-        np.testing.assert_allclose(found[kept], expected.numpy()[kept], atol=1e-3)
-    (found,), (scores,), (labels,) = exported
-    assert (np.diff(scores) <= 0).all() and scores[0] > 0.9
-    for label in set(labels) if name == "NanoDet" else ():  # two of a class do not overlap
-        own = found[(labels == label) & (scores > 0)].astype(float)
-        assert (boxes.iou(own, own) - np.eye(len(own))).max() <= 0.6
-
-
-# -- made-up photographs, and scenes of them ----------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -137,37 +76,6 @@ def test_scenes_are_the_same_again_with_exact_boxes(made_up, split, monkeypatch)
     assert flat.shape == (512, 512, 3) and np.abs((box[:2] + box[2:]) / 2 - 256).max() < 1.5
     longer = 2 * math.atan((box[2:] - box[:2]).max() / 512)
     assert longer == pytest.approx(scene.things[0].size, abs=0.02)
-
-
-class White:
-    """A detector of white things; it finds none at the border, where tiles cut them."""
-
-    mean, std, side, name = (0.0,), (1.0,), 512, "white"
-
-    def normalised(self, image):
-        return image.transpose(2, 0, 1).astype(np.float32) / 255
-
-    def __call__(self, image):
-        *_, rows, _ = cv2.connectedComponentsWithStats((image[0] > 0.5).astype(np.uint8))
-        x, y, width, height = rows[1:, :4].T
-        found = np.stack((x, y, x + width, y + height), 1).astype(float)
-        found = found[((found > 1) & (found < np.array(image.shape[:0:-1] * 2) - 1)).all(1)]
-        return found, np.full(len(found), 0.9), np.zeros(len(found), int)
-
-
-LOOKS = Look("raw"), Look("mercator"), Look("square"), tiles(5), slices(2, 576), slices(3, 410)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("look", LOOKS, ids=lambda look: f"{look.view} {look.options}")
-def test_detections_come_back_to_the_picture(made_up, look):
-    scene, picture = Scene(Files(made_up), "level", 0), np.zeros((SIZE, SIZE, 3), np.uint8)
-    truth = np.array([[480, 480, 540, 540], [700, 500, 760, 560], [300, 200, 360, 260.0]])
-    for x, y in truth[:, :2].astype(int) + 30:
-        cv2.circle(picture, (x, y), 30, (255, 255, 255), -1)
-    found = pretrained_methods.merged([pretrained_methods.detect(look, scene, picture, White())])
-    assert len(found.boxes) == 3
-    assert (boxes.iou(truth, found.boxes.astype(float)).max(1) > 0.7).all()
 
 
 def somewhere(_, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

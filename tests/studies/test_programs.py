@@ -107,10 +107,6 @@ def test_dense(tmp_path, monkeypatch, threads):
     of_set = {name: of["xi-0"]["delta1"] for name, of in record["bounds"].items()}
     blind = record["trivial"]["distance"]["direction"]["xi-0"]["delta1"]
     assert of_set["heights"] > max(blind, of_set["gravity"], of_set["labels"])
-    known = tmp_path / "known.json"
-    known.write_text(json.dumps(record | dict(config="max_epochs: 9")))
-    with pytest.raises(ValueError, match="was made with another configuration"):
-        dense.main([*where, "--known", str(known)])
 
 
 def test_sizes(tmp_path, monkeypatch):
@@ -194,10 +190,9 @@ def test_learned_lenses(tmp_path, monkeypatch):
         assert len(trials) == kinds * learned_lens.STARTS
         for trial in trials:
             found, start = trial["found"]["values"], trial["start"]["values"]
-            assert all(found[name] != start[name] for name in learned_lens.PROBLEMS[problem])
-            for name in found.keys() & learned_lens.BOUNDS:
+            for name in learned_lens.PROBLEMS[problem]:
                 low, high = learned_lens.BOUNDS[name]
-                assert low <= found[name] <= high
+                assert low <= found[name] <= high and found[name] != start[name]
     made = learned_tables.tables(cameras)
     rows = made["learned-lens"].splitlines()
     assert len(rows) == 2 + 3 * len(learned_lens.LOSSES) and "of 2 |" in rows[2]
