@@ -61,6 +61,16 @@ SHOWN = {
     "mercator": "Mercator, one run",
     "tiles: 4, and mercator": "Mercator and 4 tiles",
 }
+# The views in the table of the page on views, and their methods.
+VIEWS = {
+    'the picture, `"none"`': "raw",
+    '`"perspective"` of 120°': "rectified, 120°",
+    '`"square"`': "concentric square",
+    **{f'`"{view}"`': view for view in ("stereographic", "cylindrical", "equirectangular")},
+    '`"mercator"`': "mercator",
+    '`"tiles:5"`': "tiles: 5",
+    '`"tiles:9"`': "tiles: 9",
+}
 SPLITS = {
     "level": "CenterNet, level",
     "small": "CenterNet, small",
@@ -185,6 +195,16 @@ def lenses_table(record: dict) -> str:
     return markdown(["mAP@0.5", *lenses], rows)
 
 
+def views_table(methods: dict) -> str:
+    """The mAP of each view, also with four times the pixels where it was measured."""
+
+    def shown(name: str) -> str:
+        return percent(methods[name]["map"]) if name in methods else ""
+
+    rows = [[view, shown(name), shown(f"{name}, 1024²")] for view, name in VIEWS.items()]
+    return markdown(["view", "of 512×512 px", "of 1024×1024 px"], rows)
+
+
 def pairs_table(pairs: list[dict]) -> str:
     """The differences of pairs of methods on the same pictures."""
     rows = []
@@ -248,6 +268,7 @@ def tables(record: dict | None) -> dict[str, str]:
     made: dict[str, Callable[[dict], str]] = {
         "facts": facts, "lenses": lenses_table, "crops": crops_table, "speed": speed_table,
         "zones": lambda record: zones_table(record["tables"][SPLITS["level"]]["methods"]),
+        "views": lambda record: views_table(record["tables"][SPLITS["level"]]["methods"]),
         **{split: lambda record, of=split: split_table(record["tables"][SPLITS[of]])
            for split in SPLITS},
         **{f"{split} pairs": lambda record, of=split: pairs_table(record["pairs"][SPLITS[of]])

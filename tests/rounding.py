@@ -1,7 +1,7 @@
 """Other roundings: what another CPU, or another version of a library, might compute.
 
-`make test-rounding` runs the tests within `Rounded`. A test that fails there compares bits with
-somebody else's library, or stands on a tie.
+`make test-numerics NUMERICS=rounding` runs the tests within `Rounded`. A test that fails there
+compares bits with somebody else's library, or stands on a tie.
 """
 
 import random

@@ -59,48 +59,41 @@ def test_environment_chooses_the_tier_at_load(asked, expected):
     assert found.strip() == (expected if expected in _module.tiers() else best)
 
 
-def configured(folder: Path, **settings) -> str:
-    """The compile commands of a build for another system or processor, which is not started."""
-    settings["TORCH_DIR"] = Path(torch.__file__).parent
-    defined = [f"-D{name}={value}" for name, value in settings.items()]
-    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", folder, *defined)
-    return (folder / "compile_commands.json").read_text()
+X86 = "generic,avx2,avx512"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("processor", "tiers"),
-    [("x86_64", "generic,avx2,avx512"), ("aarch64", "neon"), ("riscv64", "generic")],
-)
-def test_tiers_of_each_processor(processor, tiers, tmp_path):
-    commands = configured(tmp_path, CMAKE_SYSTEM_NAME="Linux", CMAKE_SYSTEM_PROCESSOR=processor)
+    ("system", "processor", "tiers"),
+    [
+        ("Linux", "x86_64", X86), ("Linux", "aarch64", "neon"), ("Linux", "riscv64", "generic"),
+        ("Darwin", "arm64", "neon"), ("Darwin", "x86_64", X86),
+    ],
+)  # fmt: skip
+def test_a_build_for_each_processor(system, processor, tiers, tmp_path):
+    """It is configured here, and not started."""
+    settings = dict(
+        TORCH_DIR=Path(torch.__file__).parent,
+        CMAKE_SYSTEM_NAME=system,
+        CMAKE_SYSTEM_PROCESSOR=processor,
+        DARSWIN_PYTHONS=f".cpython-311-{system}.so:{sysconfig.get_path('include')}",
+    )
+    if system == "Darwin":  # no compiler of this machine makes programs for macOS
+        settings |= dict(CMAKE_CXX_COMPILER_WORKS=1, CMAKE_HAVE_LIBC_PTHREAD=1)
+    defined = [f"-D{name}={value}" for name, value in settings.items()]
+    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", tmp_path, *defined)
+    commands = (tmp_path / "compile_commands.json").read_text()
     assert f"-DDARSWIN_TIERS={tiers} " in commands
     assert set(re.findall(r"-DTIER=(\w+)", commands)) == set(tiers.split(","))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("processor", "tiers"), [("arm64", "neon"), ("x86_64", "generic,avx2,avx512")]
-)
-def test_the_link_commands_on_macos(processor, tiers, tmp_path):
-    commands = configured(
-        tmp_path,
-        CMAKE_SYSTEM_NAME="Darwin",
-        CMAKE_SYSTEM_PROCESSOR=processor,
-        CMAKE_CXX_COMPILER_WORKS=1,  # no compiler of this machine makes programs for macOS
-        CMAKE_HAVE_LIBC_PTHREAD=1,
-        DARSWIN_PYTHONS=f".cpython-311-darwin.so:{sysconfig.get_path('include')}",
-    )
-    assert f"-DDARSWIN_TIERS={tiers} " in commands
-    links = re.findall(r" LINK_FLAGS = (.*)", (tmp_path / "build.ninja").read_text())
-    library, c_library, python = map(shlex.split, links)
+    if system == "Linux":
+        return
+    ninja = (tmp_path / "build.ninja").read_text()
+    library, c_library, python = map(shlex.split, re.findall(r" LINK_FLAGS = (.*)", ninja))
     for flags, exported in ((library, "darswin_*"), (c_library, "darswin_*"), (python, "PyInit_*")):
-        names = [flag for flag in flags if flag.startswith("-Wl,-exported_symbol,_")]
-        assert len(names) == 1 and fnmatch(names[0].rpartition(",_")[2], exported)
-        assert "-Wl,-dead_strip" in flags
+        (name,) = (flag for flag in flags if flag.startswith("-Wl,-exported_symbol,_"))
+        assert fnmatch(name.rpartition(",_")[2], exported) and "-Wl,-dead_strip" in flags
         assert not [flag for flag in flags if "version-script" in flag or "gc-sections" in flag]
-    assert "-Wl,-undefined,dynamic_lookup" in python
-    assert "/lib/libtorch_cpu.dylib" in (tmp_path / "build.ninja").read_text()
+    assert "-Wl,-undefined,dynamic_lookup" in python and "/lib/libtorch_cpu.dylib" in ninja
 
 
 def test_tiers_can_be_forced_and_agree():
@@ -126,31 +119,25 @@ def test_build_info():
     assert info["cxx_standard"] >= 202002 and "stable" in info["torch_abi"]
 
 
-BUILD = [sys.executable, "-m", "build", "--no-isolation"]
-
-
 @pytest.fixture(scope="module")
-def sources(tmp_path_factory) -> Path:
-    """The sdist, unpacked."""
-    folder = tmp_path_factory.mktemp("sdist")
-    output(*BUILD, "--sdist", "--outdir", folder, ROOT)
+def unpacked(tmp_path_factory) -> Path:
+    """The unpacked sdist, and in its `dist` the wheel made of it: without optimization, in a
+    fraction of the time."""
+    folder, build = (
+        tmp_path_factory.mktemp("sdist"),
+        [sys.executable, "-m", "build", "--no-isolation"],
+    )
+    output(*build, "--sdist", "--outdir", folder, ROOT)
     (sdist,) = folder.glob("darswin-*.tar.gz")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
-    return folder / sdist.name.removesuffix(".tar.gz")
-
-
-@pytest.fixture(scope="module")
-def unpacked(sources) -> Path:
-    """The folder of the sdist with the wheel made there, in its `dist`: without optimization, in a
-    fraction of the time."""
+    sources = folder / sdist.name.removesuffix(".tar.gz")
     # Stands for a Python beside this one: the same headers, and another name of the module.
-    include = sysconfig.get_path("include")
     another = sources / "another-python"
-    another.write_text(f"#!/bin/sh\necho .another-python.so:{include}\n")
+    another.write_text(f"#!/bin/sh\necho .another-python.so:{sysconfig.get_path('include')}\n")
     another.chmod(0o755)
     environment = {"CMAKE_BUILD_TYPE": "None", "DARSWIN_PYTHONS": str(another)}
-    output(*BUILD, "--wheel", sources, env=environment)
+    output(*build, "--wheel", sources, env=environment)
     return sources
 
 
@@ -267,48 +254,20 @@ def test_python_in_a_checkout_that_is_not_built_is_explained(monkeypatch, tmp_pa
         _module.load()
 
 
-@pytest.fixture
-def without(tmp_path) -> Path:
-    """A folder with the package, but without its compiled modules."""
-    shutil.copytree(ROOT / "darswin", tmp_path / "darswin", ignore=shutil.ignore_patterns("*.so"))
-    return tmp_path
-
-
-def without_module(folder: Path) -> str:
-    """What a Python prints that imports darswin from this folder, and checks the reference."""
-    program = ROOT / "tests" / "without_module.py"
-    return output(sys.executable, program, cwd=folder, env={"PYTHONPATH": str(folder)})
-
-
 @pytest.mark.slow
-def test_without_its_modules_darswin_runs_the_reference(without):
-    said = without_module(without)
-    assert f"no compiled module, {without / 'darswin' / 'libdarswin.so'}: its wheel is" in said
+@pytest.mark.parametrize("broken", [False, True])
+def test_without_its_modules_darswin_runs_the_reference_and_says_why(tmp_path, broken):
+    package, program = tmp_path / "darswin", ROOT / "tests" / "without_module.py"
+    shutil.copytree(ROOT / "darswin", package, ignore=shutil.ignore_patterns("*.so"))
+    if broken:
+        (package / "libdarswin.so").write_bytes(b"not a library")
+    said = output(sys.executable, program, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)})
+    if broken:
+        assert f"{package / 'libdarswin.so'}: file too short" in said
+        assert "make build" in said and f"torch {torch.__version__} is running" in said
+    else:
+        assert f"no compiled module, {package / 'libdarswin.so'}: its wheel is" in said
     assert "darswin.frames: cannot load" in said and "No module named 'darswin.frames._fr" in said
-
-
-@pytest.mark.slow
-def test_with_a_broken_module_darswin_runs_the_reference_and_names_the_file(without):
-    (without / "darswin" / "libdarswin.so").write_bytes(b"not a library")
-    said = without_module(without)
-    assert f"{without / 'darswin' / 'libdarswin.so'}: file too short" in said
-    assert "make build" in said and f"torch {torch.__version__} is running" in said
-
-
-@pytest.mark.slow
-def test_a_wheel_for_any_system_passes_the_tests_of_models(sources, tmp_path):
-    output(*BUILD, "--wheel", sources, "--outdir", tmp_path, env={"DARSWIN_PURE": "1"})
-    (wheel,) = tmp_path.glob("*.whl")
-    assert re.fullmatch(r"darswin-[\d.]+-py3-none-any.whl", wheel.name)
-    assert not [name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".so")]
-    site = tmp_path / "site"
-    output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", site, wheel)
-    assert str(site) in without_module(site)
-    # Of each kind of model one, and the layers and the lenses.
-    names = "darswin_ra_nano or swin_nano or dat_nano or layers or lens"
-    tests = [ROOT / "tests" / "installed.py", "-x", "-k", names]
-    done = output(sys.executable, *tests, env={"PYTHONPATH": str(site)})
-    assert re.search(r"\d\d\d passed", done) and "failed" not in done
 
 
 @pytest.mark.slow

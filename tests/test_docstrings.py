@@ -4,7 +4,6 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Iterator
-from functools import cached_property
 
 import darswin
 
@@ -27,33 +26,20 @@ def public_names() -> dict[str, object]:
     return dict(found.values())
 
 
-def public_members(of: type) -> Iterator[tuple[str, object]]:
-    """Methods and properties that a class defines itself."""
-    for name, member in vars(of).items():
-        plain = inspect.isfunction(member) or inspect.isclass(member)
-        wrapped = isinstance(member, property | cached_property | classmethod | staticmethod)
-        if not name.startswith("_") and (plain or wrapped):
-            yield name, member
-
-
-def inherits_docstring(of: type, name: str) -> bool:
-    """True if a base class in darswin describes the method, or torch does (`extra_repr`)."""
-    bases = [base for base in of.__mro__[1:] if base.__module__.startswith("darswin")]
-    described = any(inspect.getdoc(vars(base)[name]) for base in bases if name in vars(base))
-    return described or name == "extra_repr"
-
-
 def undocumented() -> Iterator[str]:
     for path, value in public_names().items():
         if inspect.isfunction(value) and not value.__doc__:
             yield path
-        if inspect.isclass(value):
-            # The default docstring of a dataclass is its signature.
-            if not vars(value).get("__doc__") or value.__doc__.startswith(f"{value.__name__}("):
-                yield path
-            for method, member in public_members(value):
-                if not getattr(member, "__doc__", None) and not inherits_docstring(value, method):
-                    yield f"{path}.{method}"
+        if not inspect.isclass(value):
+            continue
+        # The default docstring of a dataclass is its signature.
+        if not vars(value).get("__doc__") or value.__doc__.startswith(f"{value.__name__}("):
+            yield path
+        for name, member in vars(value).items():
+            known = inspect.isroutine(member) or inspect.isclass(member)
+            public = not name.startswith("_") and (known or isinstance(member, property))
+            if public and not inspect.getdoc(getattr(value, name)):  # also that of a base class
+                yield f"{path}.{name}"
 
 
 def test_every_module_has_a_docstring():

@@ -33,29 +33,31 @@ def loaded(code: str) -> set[str]:
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.mark.slow
+def test_the_package_alone_loads_nothing_and_the_help_no_torch():
+    modules = loaded("import darswin")
+    assert {name for name in modules if name.startswith("darswin")} == {"darswin"}
+    assert modules.isdisjoint({"numpy", "torch"})
+    assert loaded(COMMAND.format(["--help"])).isdisjoint({"numpy", "torch"} | HEAVY)
+
+
 @pytest.fixture(scope="module")
 def with_torch():
     return loaded("import torch")
 
 
 @pytest.mark.slow
-def test_the_package_alone_loads_nothing():
-    modules = loaded("import darswin")
-    assert {name for name in modules if name.startswith("darswin")} == {"darswin"}
-    assert modules.isdisjoint({"numpy", "torch"})
-
-
-@pytest.mark.slow
-def test_the_help_needs_no_torch():
-    assert loaded(COMMAND.format(["--help"])).isdisjoint({"numpy", "torch"} | HEAVY)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("code", ["import darswin.ops", "from darswin import *"])
-def test_public_names_load_nothing_heavy(code, with_torch):
+@pytest.mark.parametrize(
+    ("code", "needed"),
+    [
+        ("import darswin.ops", "darswin.ops"),
+        ("from darswin import *", "darswin.ops"),
+        (COMMAND.format(["lens", "info", str(LENS)]), "darswin.viz.report"),
+    ],
+)
+def test_nothing_heavy_is_loaded(code, needed, with_torch):
     modules = loaded(f"import torch\n{code}")
-    assert "darswin.ops" in modules
-    assert not (modules - with_torch) & HEAVY
+    assert needed in modules and not (modules - with_torch) & HEAVY
 
 
 @pytest.mark.slow
@@ -71,13 +73,6 @@ for name in {names}:
     assert os.waitpid(process, 0)[1] == 0, name
 """
     loaded(code)
-
-
-@pytest.mark.slow
-def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
-    modules = loaded("import torch" + COMMAND.format(["lens", "info", str(LENS)]))
-    assert "darswin.viz.report" in modules
-    assert not (modules - with_torch) & HEAVY
 
 
 def test_every_public_name_is_found():

@@ -84,14 +84,11 @@ WRONG = {
 }
 
 
-@pytest.fixture(scope="module")
-def check(tmp_path_factory):
-    """Checks code by mypy in an empty folder, where darswin is installed by `pip install -e`.
-
-    pip calls the same function of setuptools, and unpacks the wheel as is done here.
-    """
-    folder = tmp_path_factory.mktemp("types")
-    source, programs, elsewhere = (folder / name for name in ("source", "bin", "elsewhere"))
+@pytest.mark.slow
+def test_the_types_of_an_editable_install(tmp_path):
+    """By mypy in an empty folder, after `pip install -e` elsewhere: pip calls the same function of
+    setuptools, and unpacks the wheel as is done here."""
+    source, programs, elsewhere = (tmp_path / name for name in ("source", "bin", "elsewhere"))
     for made in (source, programs, elsewhere):
         made.mkdir()
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
@@ -111,38 +108,25 @@ def check(tmp_path_factory):
     build = "from setuptools.build_meta import build_editable as b; b('dist')"
     built = run(sys.executable, "-c", build, cwd=source)
     assert built.returncode == 0, built.stdout + built.stderr
-    venv.create(folder / "venv", with_pip=False)
-    (packages,) = (folder / "venv").glob("lib/python*/site-packages")
+    venv.create(tmp_path / "venv", with_pip=False)
+    (packages,) = (tmp_path / "venv").glob("lib/python*/site-packages")
     (wheel,) = (source / "dist").glob("darswin-*.whl")
     zipfile.ZipFile(wheel).extractall(packages)
     (packages / "others.pth").write_text(sysconfig.get_path("purelib"))  # torch
-    python = folder / "venv" / "bin" / "python"
-
-    def by_mypy(code: str) -> str:
-        (elsewhere / "code.py").write_text(code)
-        found = run(
-            sys.executable, "-m", "mypy", "--python-executable", python, "code.py", cwd=elsewhere
-        )
-        return found.stdout + found.stderr
+    python = tmp_path / "venv" / "bin" / "python"
 
     where = "import darswin.ops; print(darswin.__file__)"
     found = run(python, "-c", where, cwd=elsewhere)
     assert found.stdout.strip() == str(source / "darswin" / "__init__.py"), found.stderr
-    return by_mypy
-
-
-@pytest.mark.slow
-def test_the_types_of_an_editable_install(check):
-    assert check(CODE).startswith("Success: no issues found")
-
-
-@pytest.mark.slow
-def test_mistakes_that_types_show(check):
-    preamble = "import darswin\nfrom darswin import create_model, lens, load_model\n"
-    lines = check(preamble + "\n".join(WRONG)).splitlines()
-    for place, (code, kind) in enumerate(WRONG.items(), start=3):
-        errors = [line for line in lines if line.startswith(f"code.py:{place}: error: ")]
-        assert len(errors) == 1 and errors[0].endswith(f"[{kind}]"), (code, lines)
+    code = [*CODE.splitlines(), *WRONG]
+    (elsewhere / "code.py").write_text("\n".join(code))
+    found = run(
+        sys.executable, "-m", "mypy", "--python-executable", python, "code.py", cwd=elsewhere
+    )
+    *errors, summary = [line for line in found.stdout.splitlines() if " note: " not in line]
+    assert summary.startswith("Found "), found.stdout + found.stderr
+    told = {code[int(line.split(":")[1]) - 1]: line.rpartition(" ")[2] for line in errors}
+    assert told == {line: f"[{kind}]" for line, kind in WRONG.items()}, found.stdout
 
 
 def test_the_names_of_each_class():

@@ -55,7 +55,6 @@ def blocks(page: Path) -> list[Block]:
     return [Block(match[2], match[3]) for match in FENCE.finditer(page.read_text())]
 
 
-JSON = [(page, block) for page in PAGES for block in blocks(page) if block.language == "json"]
 CODE = [page for page in PAGES if {block.language for block in blocks(page)} & {"python", "sh"}]
 
 
@@ -68,13 +67,10 @@ def test_every_block_is_of_a_kind_that_is_checked():
         text, found = page.read_text(), blocks(page)
         for block in found:
             assert block.language in {"python", "sh", "json"} | DIRECTIVES, (page, block)
+            if block.language == "json":
+                json.loads(block.text)
         assert len(re.findall(r"^(?:```|:::)", text, re.M)) == 2 * len(found), page
     assert len(CODE) > 12
-
-
-@pytest.mark.parametrize("page, block", JSON, ids=[page_name(page) for page, _ in JSON])
-def test_json_can_be_parsed(page, block):
-    json.loads(block.text)
 
 
 @pytest.fixture(scope="module")
@@ -111,16 +107,19 @@ def scratch(granted, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", CODE, ids=page_name)
 def test_code_runs_as_it_stands(page, scratch, monkeypatch):
-    scope: dict = {}
+    scope, left = {}, []
     for block in blocks(page):
         if "import openvino" in block.text and importlib.util.find_spec("openvino") is None:
             continue  # it is in no extra
         if block.language == "python":
             scope = {} if page.name in ALONE else scope
             run_python(block.text, scope)
+            left.append(scope.copy())
         elif block.language == "sh":
             for command in commands(block.text):
                 PROGRAMS[command[0]](command[1:], monkeypatch)
+    if page.stem in RESULTS:
+        RESULTS[page.stem](*left)
 
 
 def run_python(text: str, scope: dict) -> None:
@@ -252,24 +251,18 @@ PROGRAMS: dict[str, Callable] = {
 }
 
 
-@pytest.mark.slow
-def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
-    scope: dict = {}
-    for block in blocks(ROOT / "docs/howto/use.md"):
-        if block.language == "python" and "polar" not in scope:
-            run_python(block.text, scope)
+# -- the namespaces that the blocks of some pages leave, one for each ---------------------------
+
+
+def check_use(*after: dict) -> None:
+    """The drop-in gives the values of what it replaces."""
+    scope = next(scope for scope in after if "polar" in scope)
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_a_detector_finds_the_same_with_torch_and_without_and_by_the_command(scratch, monkeypatch):
-    scope: dict = {}
-    for block in blocks(ROOT / "docs/tutorials/detector.md"):
-        if block.language == "python":
-            run_python(block.text, scope)
-        else:
-            (command,) = commands(block.text)
-            PROGRAMS[command[0]](command[1:], monkeypatch)
+def check_detector(*after: dict) -> None:
+    """A detector finds the same with torch, without it and by the command."""
+    *_, scope = after
     with_torch = scope["found"]["boxes"][scope["found"]["scores"] > 0.3]
     alone = scope["there"][scope["best"]]
     (entry,) = json.loads(Path("found/predictions.json").read_text())
@@ -282,13 +275,9 @@ def test_a_detector_finds_the_same_with_torch_and_without_and_by_the_command(scr
     assert all(np.abs(one - cv2.imread("examples/parking.jpg")).max() > 100 for one in drawn)
 
 
-@pytest.mark.slow
-def test_the_answers_have_the_numbers_that_their_comments_tell(scratch):
-    found = []
-    for block in blocks(ROOT / "docs/answers.md"):
-        found.append({})
-        run_python(block.text, found[-1])
-    opencv, kitti, remap, woodscape, depth, grid, own = found
+def check_answers(*answers: dict) -> None:
+    """The answers have the numbers that their comments tell."""
+    opencv, kitti, remap, woodscape, depth, grid, own = answers
     assert opencv["wrong"].flat[0] == pytest.approx(82, abs=0.5)
     assert opencv["right"][0, 0] == pytest.approx(1282, abs=0.5)
     assert opencv["view"].any((0, 2)).all()  # no column is black: 190° are all there
@@ -315,3 +304,10 @@ def test_the_answers_have_the_numbers_that_their_comments_tell(scratch):
             grid["picture"].movedim(-1, 1), torch.zeros(1, 2, 2, 2), align_corners=False
         )
     assert len(own["lenses"]) == len(own["images"]) and own["images"].shape[1:] == (3, 32, 32)
+
+
+RESULTS: dict[str, Callable] = {
+    "answers": check_answers,
+    "detector": check_detector,
+    "use": check_use,
+}

@@ -62,7 +62,7 @@ def damaged(content, rng):
     """Copies with one flipped bit in each part of the file, more of them at both ends, and with cut
     ends."""
     size = len(content)
-    parts = [*range(0, min(size, 2500), 8), *range(max(size - 2500, 0), size, 8)]
+    parts = [*range(0, min(size, 2500), 16), *range(max(size - 2500, 0), size, 16)]
     for start in (*parts, *range(0, size, max(size // 300, 1))):
         changed = bytearray(content)
         changed[rng.randrange(start, min(start + max(size // 300, 8), size))] ^= 1 << rng.randrange(

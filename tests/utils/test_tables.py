@@ -31,13 +31,10 @@ def test_beyond_the_border_and_beside_nan_there_is_nothing():
     inside = [[-0.5, 2], [2, 3.5], [4.5, 1]]
     np.testing.assert_allclose(read_table(table, np.array(inside)), 1)
     assert read_table(table, np.zeros((0, 2))).shape == (0, 2)
-
-
-def test_a_table_of_one_entry_or_one_row_is_constant_across():
-    one = np.full((1, 1, 2), 3.0)
+    # A table of one entry or one row is constant across.
+    one, row = np.full((1, 1, 2), 3.0), np.arange(4.0).reshape(1, 4, 1)
     np.testing.assert_allclose(read_table(one, np.array([[0.2, -0.3]])), 3)
-    table = np.arange(4.0).reshape(1, 4, 1)
-    np.testing.assert_allclose(read_table(table, np.array([[1.5, 0.4]])), [[1.5]])
+    np.testing.assert_allclose(read_table(row, np.array([[1.5, 0.4]])), [[1.5]])
 
 
 @pytest.mark.parametrize("shape", [(3,), (5, 1), ()])

@@ -26,16 +26,11 @@ def test_frames_are_what_was_written(tmp_path, name):
     (grey, *_) = read_frames(tmp_path / name, channels=1)
     expected = cv2.cvtColor(frames[0].image, cv2.COLOR_RGB2GRAY)[..., None]
     assert np.abs(grey.image.astype(int) - expected).max() <= 1
-
-
-def test_every_so_many_frames(tmp_path):
-    write_video(tmp_path / "a.mp4", 10)
-    every = list(read_frames(tmp_path / "a.mp4"))
-    third = list(read_frames(tmp_path / "a.mp4", every=3))
-    assert [frame.number for frame in third] == [0, 3, 6, 9]
+    third = list(read_frames(tmp_path / name, every=3))
+    assert [frame.number for frame in third] == list(range(0, 30, 3))
     for frame in third:
-        assert frame.time == every[frame.number].time
-        assert np.array_equal(frame.image, every[frame.number].image)
+        assert frame.time == frames[frame.number].time
+        assert np.array_equal(frame.image, frames[frame.number].image)
 
 
 @pytest.mark.parametrize(("degrees", "turns"), [(0, 0), (90, -1), (180, 2), (270, 1)])
@@ -50,8 +45,9 @@ def test_frames_come_upright(tmp_path, degrees, turns):
         assert frame.orientation == {0: 1, 90: 6, 180: 3, 270: 8}[degrees]
 
 
-@pytest.mark.parametrize("name", ["a.avi", "a.mkv"])
-@pytest.mark.parametrize("part", [0.5, 0.7, 0.85])
+@pytest.mark.parametrize(
+    ("name", "part"), [("a.avi", 0.5), ("a.mkv", 0.7), ("a.avi", 0.85), ("a.mkv", 0.5)]
+)
 def test_a_video_that_is_cut_off(tmp_path, name, part):
     path = tmp_path / name
     write_video(path, 40, codec=FORMATS[name])
@@ -107,7 +103,7 @@ class Camera:
         self.released = True
 
 
-@pytest.mark.parametrize(("every", "pause"), [(1, 0.0), (1, 0.05), (3, 0.0), (4, 0.06)])
+@pytest.mark.parametrize(("every", "pause"), [(1, 0.05), (3, 0.0)])
 def test_a_camera_gives_its_newest_frames(monkeypatch, every, pause):
     monkeypatch.setattr(video.cv2, "VideoCapture", Camera)
     numbers, times = [], []
@@ -124,16 +120,14 @@ def test_a_camera_gives_its_newest_frames(monkeypatch, every, pause):
     assert video.read_stream("rtsp://a", 1).__next__().image.shape == (6, 8, 1)
 
 
-def test_a_camera_that_is_left_is_released(monkeypatch):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_camera_that_is_left_or_fails_is_released(monkeypatch):
     monkeypatch.setattr(video.cv2, "VideoCapture", Camera)
     frames = video.read_stream("/dev/video0")
     next(frames)
     frames.close()
     assert Camera.latest.released and Camera.latest.source == "/dev/video0"
 
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_camera_that_fails_ends(monkeypatch):
     def read(self):
         if self.count == 2:
             raise video.cv2.error("broken")
