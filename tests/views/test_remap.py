@@ -20,7 +20,6 @@ VIEWS = {
     "crop": CropView((10, 20, 71, 83), (34, 45)),
     "crop at its size": CropView((10, 20, 34, 45), (34, 45), Turn(mirrored=True)),
     "turned crop": CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
-    "crop of each pixel": CropView((10, 20, 71, 83), (34, 45), Turn(-0.6), each_pixel=True),
 } | {name: make_view(name, SIZE if name == "none" else (40, 40)) for name in OF_PIXELS}
 
 
