@@ -1,4 +1,4 @@
-"""Points and labels of every form go through every lens and view, against masks and OpenCV."""
+"""Labels and points of every form go through every lens and view, against masks and OpenCV."""
 
 import functools
 import math
@@ -67,31 +67,17 @@ def is_whole(mask):
     return mask.sum() > 300 and mask[1:-1, 1:-1].sum() == mask.sum()
 
 
-def of_models(rows):
-    """Each view with a few models of lenses in turn; with all in `make test-products`."""
-    models = [*every_lens()]
-    yield from ((name, models[k :: len(rows)]) for k, name in enumerate(rows))
-    yield from (pytest.param(name, models, marks=[slow, products]) for name in rows)
+MODELS = [*every_lens()]
 
 
-@pytest.mark.parametrize(("name", "models"), of_models(OF_PIXELS))
-def test_points_go_through_every_lens_and_come_back(name, models):
-    for lens, size in map(every_lens().get, models):
-        view = make_view(name, size if name == "none" else (200, 200))
-        places = np.random.default_rng(0).uniform(0, 1, (1000, 2)) * size[::-1] - 0.5
-        shares = []
-        for tile in view.at(lens, size).tiles:
-            points = tile.to_view(places)
-            seen = ((points > 0) & (points < (size[::-1] if name == "none" else 199))).all(-1)
-            shares.append(seen.mean())
-            again = tile.to_image(points[seen])
-            np.testing.assert_allclose(again, places[seen], rtol=0, atol=2e-4)
-        assert max(shares) > 0.01
-        beyond = tile.to_view(np.array([[-2.0, 5.0], [5.0, size[0] + 1.0]]))
-        assert np.isnan(tile.to_image(beyond)).any(-1).all()
-
-
-@pytest.mark.parametrize(("name", "models"), of_models(OF_PIXELS))
+# Each view with a few models of lenses in turn; with all in `make test-products`.
+@pytest.mark.parametrize(
+    ("name", "models"),
+    [
+        *((name, MODELS[k :: len(OF_PIXELS)]) for k, name in enumerate(OF_PIXELS)),
+        *(pytest.param(name, MODELS, marks=[slow, products]) for name in OF_PIXELS),
+    ],
+)
 def test_labels_of_every_form_go_through_every_lens(name, models):
     checked, overlaps = set(), []
     view_size = {"none": SIZE, "panorama": (150, 420)}.get(name, (180, 180))

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
-from lens_examples import FRONT
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
@@ -240,15 +239,7 @@ def test_pixels_are_means_of_their_points(name):
 
 
 def test_a_view_that_shrinks_is_as_opencv_reduces_a_flat_picture():
-    lens, noise = FRONT.to(f64), np.random.default_rng(0).random((966, 1280)).astype(np.float32)
-
-    def seen(size, **options):
-        return make_view("perspective", size, fov=1.5, **options).at(lens, noise.shape)(noise)
-
-    means = seen((480, 640), supersampling=1).reshape(30, 16, 40, 16).mean((1, 3))
-    single = np.abs(seen((30, 40), supersampling=1) - means).mean()
-    assert np.abs(seen((30, 40)) - means).mean() < single / 3
-    picture = (noise[:60, :80] * 255).astype(np.uint8)
+    picture = np.random.default_rng(0).integers(256, size=(60, 80), dtype=np.uint8)
     view = make_view("perspective", (30, 40), fov=2 * math.atan(40 / 60), supersampling=2)
     reduced = view.at(Perspective(60.0, 1.2), (60, 80))(picture)
     expected = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA)

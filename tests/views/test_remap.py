@@ -5,9 +5,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.testing import assert_close
 
-from darswin.frames import Sampler
 from darswin.lens import Equidistant, KannalaBrandt, Spherical
 from darswin.views import CameraView, CropView, Turn, list_views, make_view
 
@@ -110,12 +108,6 @@ def test_pictures_and_maps_that_do_not_fit_are_refused():
             call()
 
 
-def test_frames_with_the_channels_last_are_seen_as_those_with_the_channels_first():
-    remap = make_view("mercator", (8, 8)).at(CUT, SIZE)
-    frames = torch.randint(256, (2, *SIZE, 3), dtype=torch.uint8)
-    assert_close(remap(frames), remap(frames.permute(0, 3, 1, 2)))
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_a_crop_beyond_the_picture_is_padded(mirrored):
     picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
@@ -126,11 +118,3 @@ def test_a_crop_beyond_the_picture_is_padded(mirrored):
         top, left, height, width = part[0] + 50, part[1] + 50, *part[2:]
         wanted = padded[top : top + height, left : left + width]
         np.testing.assert_array_equal(crop.at(CUT, SIZE)(picture), wanted)
-
-
-def test_a_plan_normalizes_as_the_view_says():
-    view = make_view("mercator", (16, 20), mean=[0.5, 0.4, 0.3], std=[0.2, 0.3, 0.4])
-    remap = view.at(CUT, SIZE)
-    picture = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
-    planes = torch.from_numpy(picture).permute(2, 0, 1)[None]
-    np.testing.assert_allclose(Sampler(remap.plan("image"))(picture), remap(planes)[0], atol=2e-5)
