@@ -78,15 +78,6 @@ def test_the_half_pixel():
     assert np.flatnonzero(carried_mask[0]).tolist() == [6, 7, 8, 9]
 
 
-def test_an_affine_map_is_exact_for_ellipses():
-    """The box of an ellipse after a rotation, by the quadratic form of the ellipse."""
-    a, b, turn = 40.0, 25.0, 0.6
-    matrix = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    carried, _ = boxes.carry([[-a, -b, a, b]], lambda p: (p + 0.5) @ matrix.T - 0.5)
-    half = np.sqrt(np.diag(matrix @ np.diag([a * a, b * b]) @ matrix.T))
-    np.testing.assert_allclose(carried, [[*-half, *half]], rtol=2e-3)
-
-
 def test_the_map_is_called_twice_for_all_boxes():
     calls = []
     boxes.carry(np.tile([0.0, 0, 9, 9], (100, 1)), lambda p: calls.append(p.shape) or p)
