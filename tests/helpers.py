@@ -42,6 +42,17 @@ def product(*tables):
     ]
 
 
+def in_turn(rows, last):
+    """Rows, each with one value of a last table in turn, for `parametrize`; those with its other
+    values are left to `make test-products`."""
+    last = list(last)
+    return [
+        pytest.param(*row, value, marks=[] if k % len(last) == place else [slow, products])
+        for k, row in enumerate(rows)
+        for place, value in enumerate(last)
+    ]
+
+
 def slow_but(rows, *fast):
     """The rows, for `parametrize`: all but some are slow."""
     return [

@@ -6,10 +6,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import CAMERAS
+from torch.testing import assert_close
 
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
+from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS
 from darswin.ops import polar_sample, polar_to_image
 from darswin.views import PolarView
@@ -39,9 +41,9 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
 def test_ring_borders_in_pixels(xi, spacing, radii):
     borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders
     got = borders[0, [1, 2, 4, 8, 12, 15]]
-    torch.testing.assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
+    assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
     assert borders[0, 0] == 0
-    torch.testing.assert_close(borders[0, -1], torch.tensor(32.0, dtype=f64))
+    assert_close(borders[0, -1], torch.tensor(32.0, dtype=f64))
 
 
 @pytest.mark.parametrize(
@@ -57,21 +59,14 @@ def test_ring_borders_in_degrees(spacing, degrees):
     lens = spherical(0.3, math.radians(175))
     borders = PolarView(**SIZES, spacing=spacing).grid(lens, (64, 64)).borders
     got = torch.rad2deg(lens.unproject(borders))[0, : len(degrees)]
-    torch.testing.assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
+    assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
 
 
 @pytest.mark.parametrize("sample_spacing", SPACINGS)
 def test_sample_spacing_splits_each_ring_equally(sample_spacing):
     lens = spherical(0.4, 2.8)
-    grid = PolarView(
-        rings=4,
-        sectors=4,
-        samples=(6, 2),
-        spacing="theta",
-        sample_spacing=sample_spacing,
-        placement="edges",
-    ).grid(lens, (64, 64))
-    theta = lens.unproject(grid.radii)
+    options = dict(spacing="theta", sample_spacing=sample_spacing, placement="edges")
+    grid = PolarView(4, 4, (6, 2), **options).grid(lens, (64, 64))
     measure = {
         "theta": lambda t: t,
         "tan": torch.tan,
@@ -81,11 +76,9 @@ def test_sample_spacing_splits_each_ring_equally(sample_spacing):
             + 2 / 3 * (1 - (1 - (t / 1.4).clamp(max=1)) ** 2.288135593220339)
         ),
     }[sample_spacing]
-    steps = measure(theta).unflatten(1, (4, 6)).diff(dim=2)
-    torch.testing.assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(
-        lens.unproject(grid.borders)[0], 1.4 * torch.arange(5, dtype=f64) / 4
-    )
+    steps = measure(lens.unproject(grid.radii)).unflatten(1, (4, 6)).diff(dim=2)
+    assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)
+    assert_close(lens.unproject(grid.borders)[0], 1.4 * torch.arange(5, dtype=f64) / 4)
 
 
 def test_works_beyond_90_degrees_except_for_tan():
@@ -101,15 +94,12 @@ def test_works_beyond_90_degrees_except_for_tan():
 
 
 def test_center_and_batch():
-    lens = Perspective([10.0, 20.0], 1.0, center=[[3.0, 4.0], [5.0, 6.0]])
-    grid = PolarView(**SIZES).grid(lens, (48, 64))
+    view, lens = PolarView(**SIZES), Perspective([10.0, 20.0], 1.0, center=[[3.0, 4.0], [5.0, 6.0]])
+    grid = view.grid(lens, (48, 64))
     assert grid.center.tolist() == [[3.0, 4.0], [5.0, 6.0]]
-    torch.testing.assert_close(grid.radii[1], 2 * grid.radii[0])
-    assert PolarView(**SIZES).grid(Perspective(10.0, 1.0), (48, 64)).center.tolist() == [
-        [31.5, 23.5]
-    ]
-    empty = PolarView(**SIZES, spacing="tan").grid(lens[:0], (48, 64))
-    assert empty.radii.shape == (0, 160)
+    assert_close(grid.radii[1], 2 * grid.radii[0])
+    assert view.grid(Perspective(10.0, 1.0), (48, 64)).center.tolist() == [[31.5, 23.5]]
+    assert PolarView(**SIZES, spacing="tan").grid(lens[:0], (48, 64)).radii.shape == (0, 160)
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -119,14 +109,10 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
     focal = torch.tensor([20.0, 25.0], dtype=f64, requires_grad=True)
     theta_max = torch.tensor([1.2, 1.3], dtype=f64, requires_grad=True)
 
+    view = PolarView(3, 4, (3, 2), spacing=spacing, sample_spacing=sample_spacing)
+
     def radii(xi, focal, theta_max):
-        return (
-            PolarView(
-                rings=3, sectors=4, samples=(3, 2), spacing=spacing, sample_spacing=sample_spacing
-            )
-            .grid(Spherical(xi, focal, theta_max), (64, 64))
-            .radii
-        )
+        return view.grid(Spherical(xi, focal, theta_max), (64, 64)).radii
 
     assert torch.autograd.gradcheck(radii, (xi, focal, theta_max))
 
@@ -173,15 +159,14 @@ def camera(**aside):
 def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
     lens = camera(**aside)
     grid = PolarView(**SIZES, spacing=spacing).grid(lens, (1400, 1400))
-    direction = torch.stack((torch.cos(grid.azimuths), torch.sin(grid.azimuths)), -1)
-    around = grid.radii[0, :, None, None] * direction
+    around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
     matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
     points = grid.center[0] + around @ matrix.T
     if grid.offsets is not None:
         points = points + grid.offsets[0].permute(1, 2, 0)
     theta = lens.unproject(grid.radii[0])
     expected = lens.project_rays(theta[:, None], grid.azimuths[None])
-    torch.testing.assert_close(points, expected, rtol=0, atol=1e-8)
+    assert_close(points, expected, rtol=0, atol=1e-8)
     assert (grid.affine is None) == ("affine" not in aside)
     assert (grid.offsets is None) == (not {"tangential", "prism"} & aside.keys())
     if grid.offsets is not None:
@@ -200,24 +185,23 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
     for made in ("grid", "pixel_grid"):
         found, expected = (getattr(s, made)(a, size) for s, a in ((spec, lens), (usual, cut)))
         for a, b in zip(found[:-1], expected[:-1], strict=True):
-            if b is None:
-                assert a is None
-            else:  # `cut` has no points beyond its θ_max
-                torch.testing.assert_close(a[~b.isnan()], b[~b.isnan()])
+            assert (a is None) == (b is None)
+            if b is not None:  # `cut` has no points beyond its θ_max
+                assert_close(a[~b.isnan()], b[~b.isnan()])
     # A lens that sees less: no points beyond its θ_max, and the ring of a pixel is that of its θ.
     spec = PolarView(**sizes, theta_max=1.5 * end)
     theta = (torch.arange(24, dtype=f64) + 0.5) / 24 * 1.5 * end
     grid = spec.grid(lens, size)
     assert torch.equal(grid.radii.isnan()[0], theta > end)
     seen = theta[theta <= end][None]
-    torch.testing.assert_close(grid.radii[:, : seen.shape[1]], lens.project(seen))
+    assert_close(grid.radii[:, : seen.shape[1]], lens.project(seen))
     assert (grid.borders.diff() > 0).all() and grid.borders.isfinite().all()
     *pixels, _ = spec.pixel_grid(lens, size)
-    names = ("r_max", "center", "affine", "points")
+    r_max, center, affine, points = pixels[1:]
     angles = (torch.arange(8, dtype=f64) + 0.5) / 8 * 1.5 * end
     of_ring = angles[None, :, None, None].expand(1, 8, 12, 1)
-    given = dict(zip(names, pixels[1:], strict=True))
-    found = polar_to_image(of_ring, pixels[0], given.pop("center"), size, **given)[0, 0]
+    options = dict(r_max=r_max, affine=affine, points=points)
+    found = polar_to_image(of_ring, pixels[0], center, size, **options)[0, 0]
     exact = pixel_rays(lens, size)[0][0]
     inner = (exact > angles[0]) & (exact < end)
     assert inner.any() and (found[inner] - exact[inner]).abs().max() < 0.1 * end
@@ -227,11 +211,10 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
     lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
-    rays = PolarView(4, 8, (1, 1), spacing=spacing).token_rays(lens)
-    grid = PolarView(rings=4, sectors=8, samples=(1, 1), spacing=spacing).grid(lens, (64, 64))
-    x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
-    pixels = torch.stack((x, y), -1) + grid.center[0]
-    torch.testing.assert_close(rays, lens.unproject_points(pixels[None]))
+    view = PolarView(4, 8, (1, 1), spacing=spacing)
+    grid = view.grid(lens, (64, 64))
+    around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
+    assert_close(view.token_rays(lens), lens.unproject_points((around + grid.center[0])[None]))
 
 
 # -- samples and their embedding ----------------------------------------------------------------
@@ -240,16 +223,14 @@ LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
 
 def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
-    images = torch.randn(2, 3, 32, 33)
-    sample = PolarView(4, 8, (3, 2), spacing="tan", layout="image")
-    grid = PolarView(rings=4, sectors=8, samples=(3, 2), spacing="tan").grid(LENSES, (32, 33))
-    x = grid.center[:, 0, None, None] + grid.radii[:, :, None] * torch.cos(grid.azimuths)
-    y = grid.center[:, 1, None, None] + grid.radii[:, :, None] * torch.sin(grid.azimuths)
-    mesh = torch.stack((2 * x / 32 - 1, 2 * y / 31 - 1), -1)
+    images, view = torch.randn(2, 3, 32, 33), PolarView(4, 8, (3, 2), spacing="tan", layout="image")
+    grid = view.grid(LENSES, (32, 33))
+    places = grid.radii[:, :, None, None] * direction_of(grid.azimuths) + grid.center[:, None, None]
+    mesh = 2 * places / torch.tensor([32.0, 31.0]) - 1
     expected = F.grid_sample(images, mesh, align_corners=True)
-    torch.testing.assert_close(sample(images, LENSES), expected, rtol=1e-4, atol=1e-4)
-    one = sample(images, LENSES[:1])  # one lens serves all images
-    assert torch.equal(one, sample(images, LENSES[[0, 0]]))
+    assert_close(view(images, LENSES), expected, rtol=1e-4, atol=1e-4)
+    one = view(images, LENSES[:1])  # one lens serves all images
+    assert torch.equal(one, view(images, LENSES[[0, 0]]))
 
 
 def test_the_operators_take_all_of_a_grid():
@@ -279,10 +260,10 @@ def test_samples_get_the_dtype_of_the_weights():
     for dtype in (torch.bfloat16, torch.float64, torch.float32):
         found = embed.to(dtype)(view.see(frames, prepared, dtype))
         assert taken.pop() == found.dtype == dtype
-        torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
+        assert_close(found.float(), wide, rtol=0.05, atol=0.05)
     with torch.autocast("cpu", torch.bfloat16):
         found = embed(view.see(frames, prepared))
-    torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
+    assert_close(found.float(), wide, rtol=0.05, atol=0.05)
 
 
 def test_it_jitters_only_in_training_and_by_torchs_generator():
@@ -305,7 +286,7 @@ def test_uint8_images(shape, given, last):
     planes = images.permute(0, 3, 1, 2) if last else images
     sample = PolarView(4, 8, (3, 2), mean=0.4, std=0.2)
     expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
-    torch.testing.assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+    assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -316,19 +297,16 @@ def test_a_calibrated_camera_compiles(lens):
     sample = PolarView(8, 32, (2, 2))
     images, lens = torch.rand(1, 3, 96, 128), lens.resized((96, 128))
     compiled = torch.compile(sample, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(images, lens), sample(images, lens))
+    assert_close(compiled(images, lens), sample(images, lens))
 
 
 @pytest.mark.parametrize(
     ("images", "lens", "last", "error", "message"),
     [
         (torch.zeros(3, 32, 32), LENSES, None, ValueError, r"\(B, C, H, W\), got \(3, 32"),
-        (torch.zeros(3, 1, 32, 32), LENSES, None, ValueError, "each of the 3 images, got 2"),
-        (torch.zeros(2, 1, 32, 32), None, None, TypeError, "lens must be a darswin.lens"),
         ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
         (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
         (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
-        (torch.zeros(1, 1, 9, 9), CAMERAS[0], None, ValueError, r"\(H, W\) = \(966, 1280\), got"),
     ],
 )
 def test_images_and_lenses_that_do_not_fit(images, lens, last, error, message):

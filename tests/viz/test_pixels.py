@@ -29,11 +29,6 @@ def lab(colors, protanopia=None):
     return cv2.cvtColor(srgb[None], cv2.COLOR_RGB2LAB)[0]
 
 
-def least_difference(seen):
-    apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
-    return apart[~np.eye(len(seen), dtype=bool)].min()
-
-
 @pytest.mark.parametrize("count", [0, 1, 10, 25, 255])
 def test_a_palette_has_different_colours_and_longer_ones_begin_alike(count):
     colors = palette(count)
@@ -45,7 +40,9 @@ def test_a_palette_has_different_colours_and_longer_ones_begin_alike(count):
 @pytest.mark.parametrize(("protanopia", "least"), [(None, 20), (True, 9), (False, 9)])
 def test_classes_are_told_apart_by_all_eyes(protanopia, least):
     """By a model of colour blindness that is not the palette's own."""
-    assert least_difference(lab([*palette(12), UNKNOWN], protanopia)) > least
+    seen = lab([*palette(12), UNKNOWN], protanopia)
+    apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
+    assert apart[~np.eye(len(seen), dtype=bool)].min() > least
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
@@ -69,11 +66,7 @@ def test_distances_get_darker_by_their_logarithm():
     ends = distance_image(np.array([[0.1, 1, 100, 1e6]]), 1, 100)[0]
     assert np.array_equal(ends[0], ends[1]) and np.array_equal(ends[2], ends[3])
     assert picture.shape == (1, 9, 3) and picture.dtype == np.uint8
-
-
-def test_unknown_distances_are_grey():
-    nothing = np.array([[0.0, -1, np.nan, np.inf, 5]], np.float32)
-    picture = distance_image(nothing, 1, 10)[0]
+    picture = distance_image(np.array([[0.0, -1, np.nan, np.inf, 5]], np.float32), 1, 10)[0]
     assert (picture[:4] == UNKNOWN).all() and not (picture[4] == UNKNOWN).all()
 
 
@@ -105,9 +98,8 @@ def test_boxes_are_drawn_along_their_outermost_pixels():
     assert drawn.shape == (60, 80, 3) and (image == 100).all()
     assert (drawn[49, 10:30] == [255, 0, 0]).all() and (drawn[30:50, [10, 29]] == [255, 0, 0]).all()
     assert (drawn[49, 30:50] == [0, 0, 255]).all() and (drawn[20:30, [10, 49]] == [0, 0, 255]).all()
-    assert (
-        (drawn[50:] == 100).all() and (drawn[:, :10] == 100).all() and (drawn[:, 50:] == 100).all()
-    )
+    for beside in (drawn[50:], drawn[:, :10], drawn[:, 50:]):
+        assert (beside == 100).all()
     with_text = draw_boxes(image, boxes[:1] - [[0, 30, 0, 30]], ["a"], [[255, 0, 0]])
     assert (with_text[1:14, 10:18].max(-1) < 60).any()  # letters
     assert (draw_boxes(image, np.zeros((0, 4)), [], []) == 100).all()

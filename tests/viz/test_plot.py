@@ -9,7 +9,7 @@ from PIL import Image
 
 from darswin import PolarView
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
-from darswin.views import SquareView, make_view, turned
+from darswin.views import make_view, turned
 from darswin.viz.plot import (
     FORMATS,
     draw_accuracy,
@@ -57,8 +57,7 @@ def test_draw_grid_shows_borders_and_samples(lens):
     np.testing.assert_allclose(np.sort(theta), np.repeat(expected, 16), atol=1e-6)
     turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
     np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
-    (own,) = drawn(draw_grid, np.zeros(size), lens, SAMPLER, samples=False)
-    assert not own.lines
+    assert not drawn(draw_grid, np.zeros(size), lens, SAMPLER, samples=False)[0].lines
     with pytest.raises(ValueError, match="one lens, got 2"):
         drawn(draw_grid, np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
 
@@ -101,14 +100,13 @@ def test_it_is_hatched_where_there_is_no_picture():
     azimuth = torch.atan2(y.sin(), y.cos() * x.sin())
     place = lens.to(torch.float64).project_rays(theta, azimuth, (20, 60))
     seen = (theta <= lens.theta_max) & ((place[..., 1] - 9.5).abs() <= 10)
-    view = make_view("equirectangular", (45, 90), fov=2 * math.pi, supersampling=1)
-    (axes,) = drawn(draw_view, image, lens, view)
-    np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
     # With several reads, a pixel is hatched if it reads nothing.
-    view = make_view("equirectangular", (15, 30), fov=2 * math.pi, supersampling=3)
-    (axes,) = drawn(draw_view, image, lens, view)
-    some = seen.numpy().reshape(15, 3, 30, 3).any((1, 3))
-    np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, some)
+    for reads in (1, 3):
+        size = (45 // reads, 90 // reads)
+        view = make_view("equirectangular", size, fov=2 * math.pi, supersampling=reads)
+        (axes,) = drawn(draw_view, image, lens, view)
+        expected = seen.numpy().reshape(size[0], reads, size[1], reads).any((1, 3))
+        np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, expected)
 
 
 @pytest.mark.parametrize("options", [{}, turned(0.7, -0.4), dict(up=(0.5, -1.0, 0.0))])
@@ -119,22 +117,17 @@ def test_ticks_of_a_view_are_angles_from_its_middle(options, fov):
         ("perspective", lambda angle: 20 / math.tan(fov / 2) * np.tan(angle)),
         ("equirectangular", lambda angle: 40 / fov * angle),
         ("stereographic", lambda angle: 20 / math.tan(fov / 4) * np.tan(angle / 2)),
+        ("square", lambda angle: 20 / fov * 2 * angle),
     ):
-        view = make_view(name, (30, 40), fov=fov, **options)
+        is_square = name == "square"
+        view = make_view(name, (40, 40) if is_square else (30, 40), fov=fov,
+                         **({} if is_square else options))  # fmt: skip
         (axes,) = drawn(draw_view, image, lens, view)
-        for axis, half, sign in ((axes.xaxis, 19.5, 1), (axes.yaxis, 14.5, -1)):
+        for axis, half, sign in ((axes.xaxis, 19.5, 1), (axes.yaxis, view.size[0] / 2 - 0.5, -1)):
             shown = [float(text.get_text()[:-1]) for text in axis.get_ticklabels()]
             assert len(shown) >= 3 and 0 in shown
             expected = half + sign * place(np.radians(shown))
             np.testing.assert_allclose(axis.get_ticklocs(), expected, atol=0.05)
-
-
-def test_ticks_of_the_square_and_of_views_without_any():
-    lens, image = Polynomial([20.0, 1.0, 0.5], 1.7), np.zeros((48, 80), np.uint8)
-    (axes,) = drawn(draw_view, image, lens, SquareView((41, 41), fov=2.4))
-    shown = [float(text.get_text()[:-1]) for text in axes.xaxis.get_ticklabels()]
-    expected = 20 + 20.5 * np.radians(shown) / 1.2
-    np.testing.assert_allclose(axes.xaxis.get_ticklocs(), expected, atol=0.05)
     with pytest.raises(ValueError, match="a view of one picture, got 5"):
         drawn(draw_view, image, lens, make_view("tiles", (20, 20)))
 
@@ -162,30 +155,28 @@ def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
     assert left.get_xlabel().endswith(said) and not left.texts  # a text would cross the curves
 
 
-def test_draw_lens_has_all_panels(tmp_path):
-    image = np.zeros((48, 64, 3), np.uint8)
-    lens = KannalaBrandt(20.0, [0.01], 1.7)
-    figure = draw_lens(image, lens, SAMPLER, make_view("perspective", (6, 8), fov=1.0), "ahead")
-    assert len(figure.axes) == 6  # five panels, and the second scale of the curve
-    heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
-             "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip
-    small = Figure(figsize=(1, 1))
-    for ending, format_ in FORMATS.items():
-        path = tmp_path / f"lens{ending.upper()}"
-        save_figure(figure if ending == ".png" else small, path)
-        assert path.read_bytes().startswith(heads[format_])
-
-
-def test_draw_lens_draws_a_circle_where_corners_end():
+def test_draw_lens_has_all_panels_and_a_circle_where_corners_end():
     image, lens = np.zeros((48, 64, 3), np.uint8), KannalaBrandt(20.0, [0.01], 1.7)
     view, around = make_view("perspective", (6, 8), fov=1.0), torch.linspace(0, 2 * math.pi, 361)
-    for supported, count in ((1.2, 1), (1.71, 0)):
-        axes = draw_lens(image, lens, SAMPLER, view, "ahead", supported).axes
-        drawn = [line for line in axes[0].lines if line.get_color() == "magenta"]
-        assert len(drawn) == count == axes[0].get_title().count("last corners, 68.8°")
-        for line in drawn:
+    for supported, count in ((None, 0), (1.2, 1), (1.71, 0)):
+        figure = draw_lens(image, lens, SAMPLER, view, "ahead", supported)
+        assert len(figure.axes) == 6  # five panels, and the second scale of the curve
+        partition = figure.axes[0]
+        circles = [line for line in partition.lines if line.get_color() == "magenta"]
+        assert len(circles) == count == partition.get_title().count("last corners, 68.8°")
+        for line in circles:
             expected = lens.project_rays(1.2, around, (48, 64))
             torch.testing.assert_close(torch.tensor(line.get_xydata()).float(), expected)
+    figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize(("ending", "format_"), FORMATS.items())
+def test_figures_are_saved_in_the_format_of_their_ending(ending, format_, tmp_path):
+    heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
+             "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip
+    path = tmp_path / f"lens{ending.upper()}"
+    save_figure(Figure(figsize=(1, 1)), path)
+    assert path.read_bytes().startswith(heads[format_])
 
 
 def test_a_palette_makes_a_png_small_and_keeps_its_size(tmp_path):

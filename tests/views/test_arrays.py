@@ -1,12 +1,13 @@
 """Arrays that a view turned round, and strided, big-endian and read-only ones, count as their
 copies do, wherever an array is taken."""
 
+import functools
 import warnings
 
 import numpy as np
 import pytest
+import rigs
 import torch
-from matplotlib.figure import Figure
 
 from darswin import boxes, frames, views
 from darswin.calibrate import calibrate
@@ -14,10 +15,8 @@ from darswin.calibrate.inputs import checked
 from darswin.data import FullSize, fitted
 from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial
-from darswin.viz import pixels
-from darswin.viz.plot import draw_polar
-from tests import rigs
 
+COLORS = [(k, 2 * k, 255 - k) for k in range(9)]
 RNG = np.random.default_rng(0)
 SIZE = (48, 64)
 CAMERA = Equidistant(20.0, theta_max=1.2, image_size=SIZE)
@@ -33,7 +32,11 @@ MOVED = views.CropView((4, 4, 40, 40), (30, 30), views.Turn(0.3)).at(CAMERA, SIZ
 REMAP = ROOM.at(CAMERA, SIZE)
 MERCATOR = views.MercatorView((48, 64)).at(CAMERA, SIZE)
 PLAN = camera.plan(ROOM, CAMERA, SIZE)
-FOUND = calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
+
+
+@functools.cache
+def calibrated():
+    return calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
 
 
 def _array(found):
@@ -45,9 +48,19 @@ def _rays(points):
 
 
 def _polar(picture):
+    from matplotlib.figure import Figure  # which takes long
+
+    from darswin.viz.plot import draw_polar
+
     axes = Figure().subplots()
     draw_polar(picture, CAMERA, views.PolarView(4, 8), axes=axes)
     return axes.images[0].get_array()
+
+
+def _drawn(name, *arguments):
+    from darswin.viz import pixels
+
+    return getattr(pixels, name)(*arguments)
 
 
 CASES = {
@@ -70,8 +83,11 @@ CASES = {
     "corners": (lambda a: checked(a, RIG.board, RIG.size)[0].corners, CORNERS),
     "list of corners": (lambda a: checked([*a], RIG.board, RIG.size)[0].corners, CORNERS),
     "board": (lambda a: checked(CORNERS, a, RIG.size)[1], RIG.board.numpy()),
-    "uncertainty": (FOUND.uncertainty, 10 * PLACES),
-    "uncertainty_of_theta": (FOUND.uncertainty_of_theta, np.linspace(0.1, 1, 6)),
+    "uncertainty": (lambda a: calibrated().uncertainty(a), 10 * PLACES),
+    "uncertainty_of_theta": (
+        lambda a: calibrated().uncertainty_of_theta(a),
+        np.linspace(0.1, 1, 6),
+    ),
     "carry": (lambda a: boxes.carry(a, MOVED.to_view)[0], BOXES),
     "carry_points": (lambda a: boxes.carry_points(a, MOVED.to_view), PLACES),
     "carry_polygon": (lambda a: boxes.carry_polygon(a, MOVED.to_view), PLACES),
@@ -91,10 +107,10 @@ CASES = {
     "resized picture": (fitted(SIZE, 32, "whole").at(CAMERA, SIZE), PICTURE),
     "labels": (FULL.labels, RNG.normal(size=(3, 48, 48)).astype(np.float32)),
     "distance": (FULL.distance, VALUES),
-    "label_image": (lambda a: pixels.label_image(a, pixels.palette(9)), VALUES.astype(int)),
-    "distance_image": (lambda a: pixels.distance_image(a, 1, 9), VALUES),
-    "overlay": (lambda a: pixels.overlay(a, PICTURE[::-1]), PICTURE),
-    "draw_boxes": (lambda a: pixels.draw_boxes(PICTURE, a, ["a"] * 6, pixels.palette(6)), BOXES),
+    "label_image": (lambda a: _drawn("label_image", a, COLORS), VALUES.astype(int)),
+    "distance_image": (lambda a: _drawn("distance_image", a, 1, 9), VALUES),
+    "overlay": (lambda a: _drawn("overlay", a, PICTURE[::-1]), PICTURE),
+    "draw_boxes": (lambda a: _drawn("draw_boxes", PICTURE, a, ["a"] * 6, COLORS[:6]), BOXES),
     "draw_polar": (_polar, PICTURE),
 }
 FORMS = {
