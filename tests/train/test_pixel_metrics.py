@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from darswin.train.distance import METRICS, DistanceSums
@@ -146,5 +147,4 @@ def test_zones():
     ]  # fmt: skip
     assert len(Zones([])) == 1 and not Zones([]).of(theta).any()
     for wrong in ([0], [60, 30], [30, 30], [200], [math.nan]):
-        with pytest.raises(ValueError, match="`zones` must be increasing"):
-            Zones(wrong)
+        refused("`zones` must be increasing", Zones, wrong)

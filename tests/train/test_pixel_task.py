@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from frames import WOODSCAPE
+from helpers import refused
 from scenes import write_plain
 
 from darswin.data import IGNORE
@@ -202,11 +203,9 @@ NONE = "none of the pixels of {} training images has a label"
 
 
 def test_targets_without_labels_are_refused(task, monkeypatch):
-    with pytest.raises(ValueError, match=NONE.format(4)):
-        trained_on(task, [[labels(), labels()]])
+    refused(NONE.format(4), trained_on, task, [[labels(), labels()]])
     monkeypatch.setattr(pixel_task, "_EARLY", 3)  # a long epoch is not waited for
-    with pytest.raises(ValueError, match=NONE.format(6)):
-        trained_on(attached(Segmentation(NAME), task.data), [[labels()] * 5])
+    refused(NONE.format(6), trained_on, attached(Segmentation(NAME), task.data), [[labels()] * 5])
     with pytest.raises(ValueError, match=NONE.format(2)):  # a training shorter than an epoch
         short = attached(Segmentation(NAME), task.data, is_last_batch=False)
         short.on_train_batch_end(None, (None, None, labels()), 0)
@@ -235,8 +234,7 @@ def test_absent_classes_are_named_once(task, recwarn):
 def test_distances_that_are_not_known_are_refused():
     for most, said in ((None, "not finite; a PNG must hold"), (3.0, "above `max_distance` 3 m; ")):
         task = attached(Distance(NAME), SimpleNamespace(max_distance=most))
-        with pytest.raises(ValueError, match=said):
-            trained_on(task, [[torch.zeros(2, 4, 4)]])
+        refused(said, trained_on, task, [[torch.zeros(2, 4, 4)]])
         trained_on(attached(Distance(NAME), task.data), [[torch.ones(2, 4, 4)]])
 
 
@@ -316,5 +314,4 @@ def of_task(path, name=NAME, size=None, **options):
     ],
 )
 def test_wrong_options_are_named(folder, make, message):
-    with pytest.raises(ValueError, match=message):
-        make(str(folder))
+    refused(message, make, str(folder))
