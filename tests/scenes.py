@@ -233,20 +233,16 @@ def write_outlines(folder: Path) -> Path:
     category 7, a small one of the category 3 in it, and a crowd in the first column."""
     write_plain(folder, 10, classes=None)
     shutil.rmtree(folder / "labels")
-    annotations = []
-    for k in range(10):
-        for category, box in ((3, (40, 50, 60, 80)), (7, (20, 30, 100, 90))):
-            left, top, right, bottom = box
-            outline = [left, top, right, top, right, bottom, left, bottom]
-            area = (right - left) * (bottom - top)
-            item = {"image_id": k, "category_id": category, "segmentation": [outline]}
-            annotations.append(item | {"area": area, "iscrowd": 0})
-        crowd = {"counts": [0, 121, 159 * 121], "size": [121, 160]}
-        item = {"image_id": k, "category_id": 3, "segmentation": crowd}
-        annotations.append(item | {"area": 121, "iscrowd": 1})
-    images = [
-        {"id": k, "file_name": f"{k:03d}.png", "height": 121, "width": 160} for k in range(10)
+    small, large = [40, 50, 60, 50, 60, 80, 40, 80], [20, 30, 100, 30, 100, 90, 20, 90]
+    crowd = {"counts": [0, 121, 159 * 121], "size": [121, 160]}
+    objects = [
+        {"category_id": 3, "segmentation": [small], "area": 600, "iscrowd": 0},
+        {"category_id": 7, "segmentation": [large], "area": 4800, "iscrowd": 0},
+        {"category_id": 3, "segmentation": crowd, "area": 121, "iscrowd": 1},
     ]
+    annotations = [{"image_id": k} | object_ for k in range(10) for object_ in objects]
+    size = {"height": 121, "width": 160}
+    images = [{"id": k, "file_name": f"{k:03d}.png"} | size for k in range(10)]
     categories = [{"id": 3, "name": "cat"}, {"id": 7, "name": "sofa"}]
     content = {"images": images, "annotations": annotations, "categories": categories}
     (folder / "annotations").mkdir()

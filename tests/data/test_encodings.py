@@ -24,37 +24,24 @@ def encode(file, content):
     return file
 
 
-@pytest.fixture
-def photos(tmp_path):
+def test_files_of_photos(tmp_path):
+    photos, lists = tmp_path / "photos", tmp_path / "lists"
     for name in ("Käfer", "dog", "cat"):
         for k in range(4):
-            write(tmp_path / "photos" / name / f"{k}.png", np.zeros((6, 8), np.uint8))
-    return tmp_path / "photos"
-
-
-@pytest.mark.parametrize("name", ["classes.txt", "classes.json", "classes.JSON"])
-def test_classes_of_photos(tmp_path, photos, name):
-    file = encode(tmp_path / name, "Käfer\ndog\n" if name[-1] == "t" else ["Käfer", "dog"])
-    assert open_source(photos, "train", classes=file).classes == ["Käfer", "dog"]
-
-
-@pytest.mark.parametrize("name", ["lists", "lists.json"])
-def test_lists_of_photos(tmp_path, photos, name):
-    lists = {"train": ["Käfer/0.png", "dog/1.png"], "val": ["dog/2.png"]}
-    if name == "lists":
-        (tmp_path / name).mkdir()
-        for split, paths in lists.items():
-            encode(tmp_path / name / f"{split}.txt", "\n".join(paths))
-    else:
-        encode(tmp_path / name, lists)
-    source = open_source(photos, "train", splits=tmp_path / name)
-    assert [source.file(k) for k in range(2)] == [photos / path for path in lists["train"]]
-
-
-@pytest.mark.parametrize("content", [LENS, {"Käfer": LENS, ".": LENS | {"focal": 8.0}}])
-def test_lenses_of_photos(tmp_path, photos, content):
-    lenses = Calibrations(encode(tmp_path / "lenses.json", content), photos)
-    assert lenses.lens_of(photos / "Käfer" / "0.png", (6, 8)).focal == 9
+            write(photos / name / f"{k}.png", np.zeros((6, 8), np.uint8))
+    for name in ("classes.txt", "classes.json", "classes.JSON"):
+        file = encode(tmp_path / name, "Käfer\ndog\n" if name[-1] == "t" else ["Käfer", "dog"])
+        assert open_source(photos, "train", classes=file).classes == ["Käfer", "dog"]
+    paths = {"train": ["Käfer/0.png", "dog/1.png"], "val": ["dog/2.png"]}
+    lists.mkdir()
+    for split in paths:
+        encode(lists / f"{split}.txt", "\n".join(paths[split]))
+    for splits in (lists, encode(tmp_path / "lists.json", paths)):
+        source = open_source(photos, "train", splits=splits)
+        assert [source.file(k) for k in range(2)] == [photos / path for path in paths["train"]]
+    for content in (LENS, {"Käfer": LENS, ".": LENS | {"focal": 8.0}}):
+        lenses = Calibrations(encode(tmp_path / "lenses.json", content), photos)
+        assert lenses.lens_of(photos / "Käfer" / "0.png", (6, 8)).focal == 9
 
 
 def plain_or_other(folder, name):

@@ -1,16 +1,18 @@
 """Before training, the headers of the files tell what `samples[i]` would refuse."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from helpers import product, refused
 from PIL import ExifTags, Image
 from pngs import PALETTE, png
 from scenes import write, write_plain
 
-from darswin.data import Calibrations, SceneSamples, open_scenes, open_source
+from darswin.data import IGNORE, Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
 from darswin.data.samples import Calibrated
@@ -155,38 +157,70 @@ def of_another_size(file):
     file.write_text(LENS.replace("30", "50"))
 
 
+LABELS = np.zeros((121, 160), np.uint8)
+METRES = np.ones((121, 160), np.float32)
+
+
+def saving(array):
+    return lambda file: np.save(file, array, allow_pickle=True)
+
+
+def writing(array, bits=8):
+    return lambda file: file.write_bytes(png(array, bits))
+
+
 @pytest.mark.parametrize(
-    ("name", "change"),
+    ("name", "change", "said"),
     [
-        *(("images/001.png", CHANGES[name]) for name in ("empty", "another shape")),
-        ("images/001.png", turned),
-        ("labels/001.png", lambda f: write(f, np.ones((9, 9), np.uint8))),
-        *(("labels/001.png", CHANGES[name]) for name in ("cut in the middle", "missing")),
-        ("distance/001.png", lambda f: write(f, np.ones((9, 9), np.uint16))),
-        ("distance/001.png", CHANGES["cut at the end"]),
-        ("distance/001.npy", lambda f: np.save(f, np.ones((9, 9), np.float32))),
-        ("distance/001.npy", lambda f: np.save(f, np.ones((121, 160), int))),
-        ("distance/001.npy", lambda f: np.savez(f.open("wb"), np.ones((121, 160)))),
-        *(("distance/001.npy", CHANGES[name]) for name in ("empty", "cut in the middle")),
-        *((name, of_another_size) for name in ("lens.json", "lenses/001.json")),
+        ("images/001.png", CHANGES["empty"], "cannot read"),
+        ("images/001.png", CHANGES["another shape"], "the calibration is for"),
+        ("images/001.png", turned, "has the EXIF orientation 6"),
+        ("labels/001.png", writing(LABELS[:-1]), r"has 120×160 px, .*images/001\.png has 121×160"),
+        ("labels/001.png", writing(LABELS, 16), "must hold an id of 8 bits .* 16 bits"),
+        ("labels/001.png", CHANGES["empty"], "cannot read"),
+        ("labels/001.png", CHANGES["cut in the middle"], "cannot read"),
+        ("labels/001.png", CHANGES["missing"], "cannot read"),
+        ("distance/001.png", writing(LABELS[:-1], 16), "has 120×160 px, "),
+        ("distance/001.png", writing(LABELS), "must hold a distance of 16 bits .* 1 × 8 bits"),
+        ("distance/001.png", CHANGES["missing"], "cannot read"),
+        ("distance/001.png", CHANGES["cut at the end"], "cannot read"),
+        ("distance/001.npy", saving(METRES[:-1]), "has 120×160 px, "),
+        ("distance/001.npy", saving(METRES[None]), r"\(H, W\), but holds float32 \(1,"),
+        ("distance/001.npy", saving(LABELS.astype(int)), "but holds int64"),
+        ("distance/001.npy", saving(np.array([[{}]])), "cannot read"),
+        ("distance/001.npy", lambda file: np.savez(file.open("wb"), METRES), "cannot read"),
+        ("distance/001.npy", CHANGES["empty"], "cannot read"),
+        ("distance/001.npy", CHANGES["cut in the middle"], "cannot read"),
+        ("lens.json", of_another_size, "the calibration is for"),
+        ("lenses/001.json", of_another_size, "the calibration is for"),
     ],
 )
-def test_scenes(tmp_path, name, change):
+def test_scenes(tmp_path, name, change, said):
     write_plain(tmp_path, 10, own_lenses="lenses" in name)
     target = "distance" if name.startswith("distance") else "labels"
     if name.endswith("npy"):
         (tmp_path / "distance" / "001.png").unlink()
-        np.save(tmp_path / name, np.ones((121, 160), np.float32))
+        np.save(tmp_path / name, METRES)
     samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
     check_files({"scenes": samples})
     change(tmp_path / name)
     if name.startswith("lens"):  # lenses are read once
         samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
     expected, found = error_of(samples.__getitem__, 1), told(samples)
-    assert expected is not None and type(found) is type(expected)
+    assert re.search(said, str(expected)) and type(found) is type(expected)
     assert str(expected) in str(found) and samples.broken == []
+    assert name.startswith("lens") or str(tmp_path / name) in str(expected)
     skipping = SceneSamples(samples.scenes, size=16, skip_broken=True)
-    assert (told(skipping) is None) == isinstance(expected, BrokenImageError)
+    if isinstance(expected, ValueError):  # a wrong target is not skipped as if its file were broken
+        assert isinstance(told(skipping), ValueError)
+        refused(said, skipping.__getitem__, 1)
+    else:
+        assert told(skipping) is None
+        image, lens, nothing = skipping[1]
+        assert (nothing == (IGNORE if target == "labels" else 0)).all()
+        assert nothing.dtype == (torch.int64 if target == "labels" else torch.float32)
+        assert lens.image_size.tolist() == [[16, 16]] and image.unique().numel() == 3
+        assert skipping.broken == [1]
 
 
 def test_some_labels_are_read(tmp_path):

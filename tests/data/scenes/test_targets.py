@@ -8,7 +8,6 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +15,7 @@ from PIL import ExifTags, Image
 from pngs import COLOUR, COLOUR_ALPHA, GREY, GREY_ALPHA, PALETTE, png
 from scenes import SIZE, write, write_plain
 
-from darswin.data import IGNORE, SceneSamples, open_scenes
+from darswin.data import IGNORE, open_scenes
 from darswin.data.scenes.targets import OddLabels, read_distance, read_labels
 from darswin.utils.image import BrokenImageError
 
@@ -94,45 +93,6 @@ def test_what_was_written_is_read(tmp_path):
     assert (read_distance(tmp_path / "u.npy", far=40.0)[0, :7] == 0).all()
     ignored = np.where(LABELS == 3, IGNORE, LABELS)
     assert (read_labels(write(tmp_path / "i.png", ignored), 3) == ignored).all()
-
-
-LABEL = np.arange(SIZE[0] * SIZE[1], dtype=np.uint8).reshape(SIZE) % 3
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "error", "message"),
-    [
-        ("labels.png", png(np.where(LABEL == 1, 3, LABEL)), ValueError, r"ids \[3\], .* 3 classes"),
-        ("labels.png", png(LABEL, 16), ValueError, "an id of 8 bits .* 16 bits"),
-        ("labels.png", png(LABEL[:-1]), ValueError, r"has 120×160 px, .*001\.png has 121×160"),
-        ("labels.png", b"", BrokenImageError, "cannot read"),
-        ("labels.png", png(LABEL)[:80], BrokenImageError, "cannot read"),
-        ("distance.png", png(LABEL), ValueError, "a distance of 16 bits .* 1 × 8 bits"),
-        ("distance.png", None, BrokenImageError, "cannot read"),
-        ("distance.npy", npy(LABEL[None] / 3), ValueError, r"\(H, W\), but holds float64 \(1,"),
-        ("distance.npy", npy(LABEL.astype(int)), ValueError, "but holds int64"),
-        ("distance.npy", npy(np.array([[{}]])), BrokenImageError, "cannot read"),
-    ],
-)
-def test_wrong_targets_are_named(tmp_path, name, content, error, message):
-    write_plain(tmp_path, 2)
-    target, suffix = name.split(".")
-    (tmp_path / target / "001.png").unlink()
-    file = tmp_path / target / f"001.{suffix}"
-    file.touch()
-    scenes = open_scenes(tmp_path, "all", target)
-    file.unlink() if content is None else file.write_bytes(content)
-    said = rf"{target}/001\.{suffix}.*{message}|{message}.*{target}/001"
-    refused(said, scenes.__getitem__, 1, error=error)
-    dataset = SceneSamples(scenes, size=16, skip_broken=True)
-    if error is ValueError:  # a wrong target is not skipped as if its file were broken
-        refused(".", dataset.__getitem__, 1)
-    else:
-        image, lens, target = dataset[1]
-        assert (target == (IGNORE if scenes.target == "labels" else 0)).all()
-        assert target.dtype == (torch.int64 if scenes.target == "labels" else torch.float32)
-        assert lens.image_size.tolist() == [[16, 16]] and image.unique().numel() == 3
-        assert dataset.broken == [1]
 
 
 def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
