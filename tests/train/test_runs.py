@@ -183,7 +183,6 @@ def test_a_refused_resume_changes_nothing(whole, capsys):
         (["--data.path", "nowhere"], "no folder nowhere"),
         (fixed, "--model.options {'embed_dim': 16} in place of", "--data.size 48 in place of 32",
          "--seed_everything 1 in place of 0"),
-        (["--data.batch_size", "4"], "--data.batch_size 4 in place of 8", "steps per epoch"),
         (["--trainer.limit_train_batches", "4"], "steps per epoch and cannot go on with 1: keep"),
         (["--trainer.max_epochs", "0"], "max_epochs=0"),
         (["--task", "distance"], "is a run of --task classification, not of distance"),

@@ -87,6 +87,9 @@ def test_what_was_written_is_read(tmp_path):
     assert error.max() <= 1 / 512 + 1e-5
     far = read_distance(tmp_path / "distance.npy", far=40.0)
     assert (far == np.where(METRES < 40, METRES, 0)).all()
+    write(tmp_path / "wrong.png", LABELS)
+    said = "must hold a distance of 16 bits .* 1 × 8 bits"
+    refused(rf"wrong\.png {said}", read_distance, tmp_path / "wrong.png")
     unknown = METRES.astype(np.float64)
     unknown[0, :7] = 0, -1, np.nan, np.inf, -np.inf, 1e300, 40.0
     np.save(tmp_path / "u.npy", unknown)
