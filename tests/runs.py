@@ -13,13 +13,13 @@ from darswin.train.task import TaskModule
 QUIET = """--data.workers 0 --trainer.enable_progress_bar false
     --trainer.enable_model_summary false""".split()  # noqa: SIM905
 UNET = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"
-# 12 batches an epoch, in steps of 5, 5 and 2.
+# 12 batches an epoch, in steps of 5, 5 and 2; few are validated.
 DIGITS = [
     *("--config", "minutes", "--data.path", "digits", "--data.limit", "96"),
     *("--data.batch_size", "8", "--trainer.max_epochs", "2", "--checkpoint_steps", "1", *QUIET),
     *("--trainer.accumulate_grad_batches", "5", "--trainer.log_every_n_steps", "1"),
     *("--model.options", "{embed_dim: 8, depths: [1, 1, 1]}", "--model.mixup", "0.8"),
-    *("--data.randaugment", "true"),
+    *("--data.randaugment", "true", "--trainer.limit_val_batches", "3"),
 ]
 PIXELS = [
     *("--data.size", "32", "--data.batch_size", "8", "--model.name", "darswin_unet_a_nano"),

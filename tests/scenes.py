@@ -15,6 +15,7 @@ from darswin.lens.pixels import pixel_rays
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 WOODSCAPE = CALIBRATIONS / "woodscape.json"
 CLASSES = {"names": ["sky", "ground", "wall"], "colors": [[0, 0, 255], [0, 128, 0], [200, 0, 0]]}
+SIZE = (121, 160)
 
 
 def labels_of(theta: np.ndarray, azimuth: np.ndarray, classes: int = 3) -> np.ndarray:
@@ -36,13 +37,26 @@ def rays_of(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return theta[0].numpy(), azimuth[0].numpy()
 
 
-def picture_of(
-    theta: np.ndarray, azimuth: np.ndarray, colors: Sequence[Sequence[int]], seed: int
-) -> np.ndarray:
-    """(H, W, 3) uint8: the labels' colours, with noise; black where nothing is seen."""
-    noise = np.random.default_rng(seed).integers(0, 40, size=(*theta.shape, 3))
-    image = np.asarray(colors)[labels_of(theta, azimuth, len(colors))] * 0.8 + noise
-    return np.where(np.isnan(theta)[..., None], 0, image).astype(np.uint8)
+def seen(
+    rays: tuple[np.ndarray, np.ndarray], number: int, colors: Sequence = CLASSES["colors"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The picture (H, W, 3) uint8, BGR, the labels and the distances of a scene; each scene is
+    turned further than the one before. The picture has the labels' colours, with noise, and is
+    black where nothing is seen."""
+    theta, azimuth = rays[0], rays[1] + 0.3 * number
+    labels = labels_of(theta, azimuth, len(colors))
+    noise = np.random.default_rng(number).integers(0, 40, size=(*theta.shape, 3))
+    picture = np.where(np.isnan(theta)[..., None], 0, np.asarray(colors)[labels] * 0.8 + noise)
+    return picture.astype(np.uint8)[..., ::-1], labels, distance_of(theta, azimuth)
+
+
+def write(file: Path, array: np.ndarray) -> Path:
+    """An array as PNG, BGR where it has colours, or distances × 256; makes its folder."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if array.dtype == np.float32:
+        array = np.round(array * 256).astype(np.uint16)
+    assert cv2.imwrite(str(file), np.ascontiguousarray(array))
+    return file
 
 
 def write_plain(
@@ -50,7 +64,7 @@ def write_plain(
     count: int = 4,
     *,
     lens: Lens | None = None,
-    size: tuple[int, int] = (121, 160),
+    size: tuple[int, int] = SIZE,
     split: str | None = None,
     own_lenses: bool = False,
     classes: dict | list | None = CLASSES,
@@ -62,22 +76,18 @@ def write_plain(
         split: a folder of a split in `folder`, or None. own_lenses: a file a picture.
     """
     place = folder if split is None else folder / split
-    seen = (load(WOODSCAPE) if lens is None else lens).in_picture(size)
-    if seen.image_size is None:
-        seen = seen.replace(image_size=torch.tensor([size], dtype=torch.float32))
-    theta, azimuth = rays_of(seen, size)
+    lens = (load(WOODSCAPE) if lens is None else lens).in_picture(size)
+    if lens.image_size is None:
+        lens = lens.replace(image_size=torch.tensor([size], dtype=torch.float32))
+    rays = rays_of(lens, size)
     for k in range(count):
-        turned, file = azimuth + 0.3 * k, f"{name(k)}.png"
-        picture = picture_of(theta, turned, CLASSES["colors"], k)
-        write(place / "images" / file, picture[..., ::-1])
-        write(place / "labels" / file, labels_of(theta, turned))
-        metres = np.round(distance_of(theta, turned) * 256).astype(np.uint16)
-        write(place / "distance" / file, metres)
+        for part, array in zip(("images", "labels", "distance"), seen(rays, k), strict=True):
+            write(place / part / f"{name(k)}.png", array)
         if own_lenses:
             (place / "lenses").mkdir(exist_ok=True)
-            save(seen, place / "lenses" / f"{name(k)}.json")
+            save(lens, place / "lenses" / f"{name(k)}.json")
     if not own_lenses:
-        save(seen, place / "lens.json")
+        save(lens, place / "lens.json")
     if classes is not None:
         (folder / "classes.json").write_text(json.dumps(classes))
     return folder
@@ -95,8 +105,21 @@ WOODSCAPE_INFO = {
 VIEWS = ("FV", "RV", "MVL", "MVR")
 
 
+def _woodscape_rays(folder: Path, number: int, size: tuple[int, int] = SIZE):
+    """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
+    gives the frame's stem and the rays of its pixels."""
+    stem, content = f"{number:05d}_{VIEWS[number % 4]}", json.loads(WOODSCAPE.read_text())
+    content["name"] = VIEWS[number % 4]
+    content["intrinsic"]["cx_offset"] += number
+    content["intrinsic"]["k1"] += number % 4
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{stem}.json"
+    file.write_text(json.dumps(content))
+    return stem, rays_of(load(file).in_picture(size), size)
+
+
 def write_woodscape(
-    folder: Path, count: int = 8, *, size: tuple[int, int] = (121, 160), nested: bool = True,
+    folder: Path, count: int = 8, *, size: tuple[int, int] = SIZE, nested: bool = True,
     calibration: str = "calibration/calibration",
 ) -> Path:  # fmt: skip
     """WoodScape's tree, `count` frames of its four cameras in turn, with green rows.
@@ -106,23 +129,20 @@ def write_woodscape(
             where the calibrations are.
     """
     annotations = folder / "semantic_annotations" / ("semantic_annotations" if nested else "")
+    colors = WOODSCAPE_INFO["class_colors"]
     for k in range(count):
-        view = VIEWS[k % 4]
-        stem, lens = f"{k:05d}_{view}", _woodscape_lens(folder / calibration, k, view, size)
-        theta, azimuth = rays_of(lens, size)
-        colors = WOODSCAPE_INFO["class_colors"]
-        image = picture_of(theta, azimuth + 0.3 * k, colors, k)
+        stem, rays = _woodscape_rays(folder / calibration, k, size)
+        image, labels, _ = seen(rays, k, colors)
         green = -(-3 * size[0] // 966)
         image[:green] = image[-green:] = (0, 255, 0)
-        write(folder / "rgb_images" / f"{stem}.png", image[..., ::-1])
-        labels = labels_of(theta, azimuth + 0.3 * k, 10)
+        write(folder / "rgb_images" / f"{stem}.png", image)
+        write(folder / "previous_images" / f"{stem}_prev.png", image)
         write(annotations / "gtLabels" / f"{stem}.png", labels)
         write(annotations / "rgbLabels" / f"{stem}.png", np.asarray(colors, np.uint8)[labels])
         boxes = folder / "box_2d_annotations" / "box_2d_annotations" / f"{stem}.txt"
         boxes.parent.mkdir(parents=True, exist_ok=True)
         boxes.write_text("vehicles,0,10,10,40,40\n")
-        write(folder / "previous_images" / f"{stem}_prev.png", image[..., ::-1])
-    write(folder / "rgb_images(test_set)" / "08234_FV.png", image[..., ::-1])
+    write(folder / "rgb_images(test_set)" / "08234_FV.png", image)
     (folder / "semantic_annotations" / "seg_annotation_info.json").write_text(
         json.dumps(WOODSCAPE_INFO)
     )
@@ -131,21 +151,15 @@ def write_woodscape(
 
 def write_synwoodscape(folder: Path) -> Path:
     """SynWoodScape's tree: labels of 25 classes, depth maps in metres in which 1000 is the sky."""
-    size = (121, 160)
+    labels_folder = folder / "semantic_annotations" / "semantic_annotations" / "gtLabels"
+    raw = folder / "depth_maps" / "raw_data"
+    raw.mkdir(parents=True)
     for k in range(4):
-        view = VIEWS[k % 4]
-        stem = f"{k:05d}_{view}"
-        lens = _woodscape_lens(folder / "calibration" / "calibration", k, view, size)
-        theta, azimuth = rays_of(lens, size)
-        colors = [[10 * k, 0, 255 - 10 * k] for k in range(25)]
-        image = picture_of(theta, azimuth, colors, k)
-        write(folder / "rgb_images" / "rgb_images" / f"{stem}.png", image[..., ::-1])
-        nested = folder / "semantic_annotations" / "semantic_annotations"
-        write(nested / "gtLabels" / f"{stem}.png", labels_of(theta, azimuth, 25))
-        metres = np.where(azimuth < -2, 1000, distance_of(theta, azimuth)).astype(np.float32)
-        raw = folder / "depth_maps" / "raw_data"
-        raw.mkdir(parents=True, exist_ok=True)
-        np.save(raw / f"{stem}.npy", metres)
+        stem, rays = _woodscape_rays(folder / "calibration" / "calibration", k)
+        image, labels, metres = seen(rays, k, [[10 * k, 0, 255 - 10 * k] for k in range(25)])
+        write(folder / "rgb_images" / "rgb_images" / f"{stem}.png", image)
+        write(labels_folder / f"{stem}.png", labels)
+        np.save(raw / f"{stem}.npy", np.where(rays[1] < -2, 1000, metres).astype(np.float32))
     return folder
 
 
@@ -154,62 +168,60 @@ def write_kitti360(folder: Path) -> Path:
     as sparse as those of a LiDAR."""
     size, count = (140, 140), 3
     (folder / "calibration").mkdir(parents=True, exist_ok=True)
-    for drive in range(3):
-        name = f"2013_05_28_drive_{drive:04d}_sync"
-        for camera in ("image_02", "image_03"):
-            source = CALIBRATIONS / f"kitti360_{camera[-2:]}.yaml"
-            shutil.copy(source, folder / "calibration" / f"{camera}.yaml")
-            theta, azimuth = rays_of(load(source).in_picture(size), size)
+    for camera in ("image_02", "image_03"):
+        calibration = folder / "calibration" / f"{camera}.yaml"
+        shutil.copy(CALIBRATIONS / f"kitti360_{camera[-2:]}.yaml", calibration)
+        rays = rays_of(load(calibration).in_picture(size), size)
+        for drive in range(3):
+            name, raw = f"2013_05_28_drive_{drive:04d}_sync", folder / "data_2d_raw"
             for k in range(count):
-                image = picture_of(theta, azimuth, CLASSES["colors"], k)
-                stem = f"{k:010d}.png"
-                write(folder / "data_2d_raw" / name / camera / "data_rgb" / stem, image[..., ::-1])
+                image, _, metres = seen(rays, k)
+                write(raw / name / camera / "data_rgb" / f"{k:010d}.png", image)
+                metres[::2] = 0
                 if k < count - 1:
-                    metres = np.round(distance_of(theta, azimuth) * 256).astype(np.uint16)
-                    metres[::2] = 0
-                    write(folder / "distance" / name / camera / stem, metres)
-        write(folder / "data_2d_raw" / name / "image_00" / "data_rect" / "0000000000.png", image)
+                    write(folder / "distance" / name / camera / f"{k:010d}.png", metres)
+            write(raw / name / "image_00" / "data_rect" / "0000000000.png", image)
     return folder
 
 
 def write_cityscapes(folder: Path) -> Path:
     """Cityscapes' tree, three pictures of "train" and one of "val", with ids from 6 to 8."""
-    theta, azimuth = rays_of(load(WOODSCAPE).in_picture((121, 160)), (121, 160))
+    rays = rays_of(load(WOODSCAPE).in_picture(SIZE), SIZE)
     for split, city, count in (("train", "aachen", 3), ("val", "lindau", 1), ("test", "bonn", 1)):
         for k in range(count):
             name = f"{split}/{city}/{city}_{k:06d}_000019"
-            image = picture_of(theta, azimuth, CLASSES["colors"], k)
-            write(folder / "leftImg8bit" / f"{name}_leftImg8bit.png", image[..., ::-1])
-            ids = labels_of(theta, azimuth + 0.3 * k) + 6
+            image, labels, _ = seen(rays, k)
+            write(folder / "leftImg8bit" / f"{name}_leftImg8bit.png", image)
             for kind in ("labelIds", "instanceIds"):
-                write(folder / "gtFine" / f"{name}_gtFine_{kind}.png", ids)
+                write(folder / "gtFine" / f"{name}_gtFine_{kind}.png", labels + 6)
     return folder
 
 
 def write_coco(folder: Path) -> Path:
     """COCO's panoptic tree, two pictures of each split, with segments of the categories 1, 17 and
     200; nothing is known at the left side."""
-    theta, azimuth = rays_of(load(WOODSCAPE).in_picture((121, 160)), (121, 160))
+    rays = rays_of(load(WOODSCAPE).in_picture(SIZE), SIZE)
     categories = [
         {"id": id_, "name": name, "color": color, "isthing": 0}
         for id_, name, color in zip((1, 17, 200), *CLASSES.values(), strict=True)
     ]
     segments = (66051, 300, 7)
+    infos = [
+        {"id": segment, "category_id": category["id"]}
+        for segment, category in zip(segments, categories, strict=True)
+    ]
     for split in ("train2017", "val2017"):
         annotations = []
         for k in range(2):
-            image = picture_of(theta, azimuth, CLASSES["colors"], k)
-            write(folder / split / f"{k:012d}.jpg", image[..., ::-1])
-            ids = np.array(segments)[labels_of(theta, azimuth + 0.3 * k)]
+            image, labels, _ = seen(rays, k)
+            write(folder / split / f"{k:012d}.jpg", image)
+            ids = np.array(segments)[labels]
             ids[:, :9] = 0
-            colors = np.stack([ids // 65536, ids // 256 % 256, ids % 256], -1)
-            name = f"{k:012d}.png"
-            png = folder / "annotations" / f"panoptic_{split}" / name
-            write(png, colors.astype(np.uint8))
-            infos = [
-                {"id": segment, "category_id": category["id"]}
-                for segment, category in zip(segments, categories, strict=True)
-            ]
+            colors, name = (
+                np.stack([ids // 65536, ids // 256 % 256, ids % 256], -1),
+                f"{k:012d}.png",
+            )
+            write(folder / "annotations" / f"panoptic_{split}" / name, colors.astype(np.uint8))
             annotations.append({"image_id": k, "file_name": name, "segments_info": infos})
         content = {"images": [], "annotations": annotations, "categories": categories}
         (folder / "annotations" / f"panoptic_{split}.json").write_text(json.dumps(content))
@@ -221,43 +233,18 @@ def write_outlines(folder: Path) -> Path:
     category 7, a small one of the category 3 in it, and a crowd in the first column."""
     write_plain(folder, 10, classes=None)
     shutil.rmtree(folder / "labels")
-    annotations = []
-    for k in range(10):
-        for category, box in ((3, (40, 50, 60, 80)), (7, (20, 30, 100, 90))):
-            left, top, right, bottom = box
-            outline = [left, top, right, top, right, bottom, left, bottom]
-            area = (right - left) * (bottom - top)
-            item = {"image_id": k, "category_id": category, "segmentation": [outline]}
-            annotations.append(item | {"area": area, "iscrowd": 0})
-        crowd = {"counts": [0, 121, 159 * 121], "size": [121, 160]}
-        item = {"image_id": k, "category_id": 3, "segmentation": crowd}
-        annotations.append(item | {"area": 121, "iscrowd": 1})
-    images = [
-        {"id": k, "file_name": f"{k:03d}.png", "height": 121, "width": 160} for k in range(10)
+    small, large = [40, 50, 60, 50, 60, 80, 40, 80], [20, 30, 100, 30, 100, 90, 20, 90]
+    crowd = {"counts": [0, 121, 159 * 121], "size": [121, 160]}
+    objects = [
+        {"category_id": 3, "segmentation": [small], "area": 600, "iscrowd": 0},
+        {"category_id": 7, "segmentation": [large], "area": 4800, "iscrowd": 0},
+        {"category_id": 3, "segmentation": crowd, "area": 121, "iscrowd": 1},
     ]
+    annotations = [{"image_id": k} | object_ for k in range(10) for object_ in objects]
+    size = {"height": 121, "width": 160}
+    images = [{"id": k, "file_name": f"{k:03d}.png"} | size for k in range(10)]
     categories = [{"id": 3, "name": "cat"}, {"id": 7, "name": "sofa"}]
     content = {"images": images, "annotations": annotations, "categories": categories}
     (folder / "annotations").mkdir()
     (folder / "annotations" / "instances_train.json").write_text(json.dumps(content))
     return folder
-
-
-def _woodscape_lens(folder: Path, number: int, view: str, size: tuple[int, int]) -> Lens:
-    """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
-    gives its lens in a picture of a size."""
-    content = json.loads(WOODSCAPE.read_text())
-    content["name"] = view
-    content["intrinsic"]["cx_offset"] += number
-    content["intrinsic"]["k1"] += number % 4
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{number:05d}_{view}.json"
-    file.write_text(json.dumps(content))
-    return load(file).in_picture(size)
-
-
-def write(file: Path, array: np.ndarray) -> Path:
-    """An array as PNG, BGR where it has colours; makes its folder."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    array = np.ascontiguousarray(array)
-    assert cv2.imwrite(str(file), array)
-    return file

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
+from helpers import refused
 from hypothesis import given
 
 from darswin.data.folders import pictures_and_videos_below
@@ -31,12 +32,12 @@ def files(source) -> list[str]:
     return [str(source.file(k)) for k in range(len(source))]
 
 
-def opened(root: Path, **options) -> dict:
-    return {split: open_source(root, split, **options) for split in SPLITS}
+def opened(root: Path, **options) -> list:
+    return [open_source(root, split, **options) for split in SPLITS]
 
 
 def counts(root: Path, **options) -> list[int]:
-    return [len(part) for part in opened(root, **options).values()]
+    return [*map(len, opened(root, **options))]
 
 
 @pytest.mark.filterwarnings("error")
@@ -54,10 +55,10 @@ def counts(root: Path, **options) -> list[int]:
 def test_splits_of_folders(tmp_path, there, expected):
     for name, count in there.items():
         pictures(tmp_path / name, "a", "b/c", count=count)
-    parts = opened(tmp_path)
-    assert [len(part) for part in parts.values()] == expected
-    assert all(part.classes == ["a", "b"] for part in parts.values())
-    assert not set(files(parts["train"])) & set(files(parts["val"]) + files(parts["test"]))
+    train, val, test = parts = opened(tmp_path)
+    assert [*map(len, parts)] == expected
+    assert all(part.classes == ["a", "b"] for part in parts)
+    assert not set(files(train)) & {*files(val), *files(test)}
 
 
 @pytest.mark.filterwarnings("error")
@@ -103,51 +104,41 @@ def test_what_is_refused(tmp_path, there, classes, error, message):
         (tmp_path / "names.txt").write_text(classes)
         classes = tmp_path / "names.txt"
     for split in SPLITS:
-        with pytest.raises(error, match=message):
-            open_source(tmp_path, split, classes=classes)
+        refused(message, open_source, tmp_path, split, classes=classes, error=error)
+
+
+CLASSES, SPLIT = ("a", "b"), ("train/a", "train/b", "val/a")
 
 
 @pytest.mark.parametrize(
-    ("there", "message"),
+    ("folders", "there", "message"),
     [
-        (["stray.png"], r"holds pictures outside the folders of classes \(1, e\.g\. .*stray\.png"),
-        (["a/x.gif", "b/y.gif"], r"does not read, 2 \.gif, e\.g\. .*a/x\.gif: left out"),
-        (["labels/x.txt"], "labels holds files, but no pictures: it is not a class"),
-        (["bird/"], "bird holds no pictures: it is not a class"),
-        (["bird/.DS_Store"], "bird holds no pictures: it is not a class"),
-        (["bird/large/", "bird/small/"], "bird holds no pictures: it is not a class"),
-        (["val/"], "val holds no pictures: it is not a class"),
-        (["few/1.jpg"], r"the classes \['few'\] have too few .*none for test or val"),
-        (["few/1.jpg", "few/2.jpg"], r"the classes \['few'\] have too few pictures"),
+        (CLASSES, "stray.png", r"pictures outside the folders of classes \(1, e\.g\. .*stray\.png"),
+        (CLASSES, "a/x.gif b/y.gif", r"does not read, 2 \.gif, e\.g\. .*a/x\.gif: left out"),
+        (CLASSES, "labels/x.txt", "labels holds files, but no pictures: it is not a class"),
+        (CLASSES, "bird/", "bird holds no pictures: it is not a class"),
+        (CLASSES, "bird/.DS_Store", "bird holds no pictures: it is not a class"),
+        (CLASSES, "bird/large/ bird/small/", "bird holds no pictures: it is not a class"),
+        (CLASSES, "val/", "val holds no pictures: it is not a class"),
+        (CLASSES, "few/1.jpg", r"the classes \['few'\] have too few .*none for test or val"),
+        (CLASSES, "few/1.jpg few/2.jpg", r"the classes \['few'\] have too few pictures"),
+        (SPLIT, "train/c/", "train/c holds no pictures: it is not a class"),
+        (SPLIT, "val/b/", "val/b holds no pictures: left out"),
+        (SPLIT, "val/c/", "val/c holds no pictures: left out"),
+        (SPLIT, "test/", "test holds no pictures: it is not a split"),
+        (SPLIT, "testing/a/", "testing holds no pictures: it is not a split"),
     ],
 )
-def test_what_is_left_out_is_named(tmp_path, there, message):
-    pictures(tmp_path, "a", "b")
-    for name in there:
+def test_what_is_left_out_is_named(tmp_path, folders, there, message):
+    pictures(tmp_path, *folders)
+    for name in there.split():
         (tmp_path / name).mkdir(parents=True) if name.endswith("/") else touch(tmp_path, name)
     with pytest.warns(LeftOut, match=message):
         parts = opened(tmp_path)
-    few = [file for file in files(parts["train"]) if "few" in file]
-    assert len(few) == sum("few" in name for name in there)
-
-
-@pytest.mark.parametrize(
-    ("empty", "message"),
-    [
-        ("train/c", r"train/c holds no pictures: it is not a class"),
-        ("val/b", r"val/b holds no pictures: left out"),
-        ("val/c", r"val/c holds no pictures: left out"),
-        ("test", r"test holds no pictures: it is not a split"),
-        ("testing/a", r"testing holds no pictures: it is not a split"),
-    ],
-)
-def test_empty_folders_of_splits_are_named(tmp_path, empty, message):
-    pictures(tmp_path, "train/a", "train/b", "val/a")
-    (tmp_path / empty).mkdir(parents=True)
-    with pytest.warns(LeftOut, match=message):
-        parts = opened(tmp_path)
-    assert [len(part) for part in parts.values()] == [20, 10, 10]
-    assert all(part.classes == ["a", "b"] for part in parts.values())
+    few = there.count("few")
+    assert [*map(len, parts)] == ([16 + few, 2, 2] if folders is CLASSES else [20, 10, 10])
+    assert all(part.classes == ["a", "b", "few"][: 2 + (few > 0)] for part in parts)
+    assert sum("few" in file for file in files(parts[0])) == few
 
 
 @pytest.mark.filterwarnings("error")
@@ -159,8 +150,7 @@ def test_links_are_followed_once(tmp_path, monkeypatch):
     assert sum(counts(root)) == 30
     for target in (tmp_path / "elsewhere" / "more", root, tmp_path):
         (root / "b" / "link").symlink_to(target)
-        with pytest.raises(ValueError, match=r"b/link.* are the same folder"):
-            open_source(root, "train")
+        refused(r"b/link.* are the same folder", open_source, root, "train")
         (root / "b" / "link").unlink()
     splits = tmp_path / "splits"
     pictures(splits / "train", "a", "b")
@@ -180,8 +170,8 @@ def test_pictures_and_videos_below_a_folder(tmp_path):
         assert pictures_and_videos_below(tmp_path) == found
     for folder, said in ((".x/y", r"in .*\.x/y$"), ("c", r"in .*c, but 1 \.heic, which")):
         (tmp_path / folder).mkdir(exist_ok=True)
-        with pytest.raises(FileNotFoundError, match=f"no pictures or videos {said}"):
-            pictures_and_videos_below(tmp_path / folder)
+        function, said = pictures_and_videos_below, f"no pictures or videos {said}"
+        refused(said, function, tmp_path / folder, error=FileNotFoundError)
 
 
 @pytest.mark.parametrize(
@@ -207,10 +197,8 @@ def test_lists_that_are_wrong(tmp_path, lists, message):
     file = tmp_path / "splits.json"
     file.write_text(lists if isinstance(lists, str) else json.dumps(lists))
     touch(tmp_path, "a/1.jpg", "a/2.jpg", "b/1.jpg")
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        open_source(tmp_path, "train", splits=file)
-    with pytest.raises(ValueError, match="`splits` is for folders"):
-        open_source("digits", "train", splits=file)
+    refused(message, open_source, tmp_path, "train", splits=file, error=(ValueError, OSError))
+    refused("`splits` is for folders", open_source, "digits", "train", splits=file)
 
 
 def test_lists_of_splits(tmp_path):
@@ -224,8 +212,8 @@ def test_lists_of_splits(tmp_path):
         train, val = (open_source(tmp_path, part, splits=splits) for part in ("train", "val"))
         assert train.labels.tolist() == [1, 0] and train.file(0) == tmp_path / "dog" / "01.png"
         assert files(val) == [str(tmp_path / "cat" / "03.png")]
-        with pytest.raises(FileNotFoundError, match="no images for the 'test' split"):
-            open_source(tmp_path, "test", splits=splits)
+        said = "no images for the 'test' split"
+        refused(said, open_source, tmp_path, "test", splits=splits, error=FileNotFoundError)
     paths = [f"{name}/{k}.jpg" for name in "ab" for k in range(10)]
     touch(tmp_path, *paths, "a/x.jpg")
     (tmp_path / "TRAIN.TXT").write_text("\n".join([*paths, paths[0], f"./{paths[1]}"]))  # once
@@ -237,15 +225,15 @@ def test_lists_of_splits(tmp_path):
 def test_the_share_that_is_held_out(tmp_path):
     pictures(tmp_path, "a", count=60)
     before = opened(tmp_path)
-    assert [len(part) for part in before.values()] == [48, 6, 6]
-    assert files(before["val"]) == files(open_source(tmp_path, "val"))
+    assert [*map(len, before)] == [48, 6, 6]
+    assert files(before[1]) == files(open_source(tmp_path, "val"))
     touch(tmp_path, "a/new.jpg")
     after = opened(tmp_path)
-    moved = [set(files(after[split])) - set(files(before[split])) for split in SPLITS]
+    moved = [{*files(new)} - {*files(old)} for new, old in zip(after, before, strict=True)]
     assert sum(map(len, moved)) <= 5  # one picture more moves hardly any
     for path in (tmp_path, "digits"):
-        with pytest.raises(FileNotFoundError, match=r"'val' split .*`holdout` 0 .*leaves none"):
-            open_source(path, "val", holdout=0)
+        said = r"'val' split .*`holdout` 0 .*leaves none"
+        refused(said, open_source, path, "val", holdout=0, error=FileNotFoundError)
 
 
 # -- any tree ---------------------------------------------------------------------------------

@@ -1,16 +1,18 @@
 """Before training, the headers of the files tell what `samples[i]` would refuse."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
-from helpers import product
+import torch
+from helpers import product, refused
 from PIL import ExifTags, Image
 from pngs import PALETTE, png
 from scenes import write, write_plain
 
-from darswin.data import Calibrations, SceneSamples, open_scenes, open_source
+from darswin.data import IGNORE, Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
 from darswin.data.samples import Calibrated
@@ -44,9 +46,8 @@ def turned(file):
 
 def with_damaged_exif(file):
     """In every format that Pillow gives EXIF data."""
-    known = {"jpg": "JPEG", "png": "PNG", "webp": "WEBP"}.get(file.suffix[1:])
-    if known:
-        Image.fromarray(PICTURE).save(file, known, exif=b"Exif\0\0nothing that is known")
+    if file.suffix in (".jpg", ".png", ".webp"):
+        Image.fromarray(PICTURE).save(file, exif=b"Exif\0\0nothing that is known")
 
 
 # What happens to a file.
@@ -69,9 +70,7 @@ CHANGES = {
 
 def write_photos(folder, suffix, count=10):
     for k in range(count):
-        file = folder / "ab"[k % 2] / f"{k}.{suffix}"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(file), PICTURE)
+        write(folder / "ab"[k % 2] / f"{k}.{suffix}", PICTURE)
     return open_source(folder, "train", holdout=0)
 
 
@@ -80,20 +79,16 @@ def of_photos(source, **options):
     yield Calibrated(source, Calibrations(LENS, source.root), size=16, **options)
 
 
-def refused(samples, index):
+def error_of(function, argument):
     try:
-        samples[index]
+        function(argument)
     except (BrokenImageError, ValueError) as error:
         return error
     return None
 
 
 def told(samples):
-    try:
-        check_files({"photos": samples})
-    except (BrokenImageError, ValueError) as error:
-        return error
-    return None
+    return error_of(check_files, {"photos": samples})
 
 
 @pytest.mark.parametrize(("change", "suffix"), product(CHANGES, SUFFIXES))
@@ -102,7 +97,7 @@ def test_what_the_check_refuses_is_what_reading_refuses(tmp_path, suffix, change
     source = write_photos(tmp_path, suffix)
     CHANGES[change](source.file(1))
     for samples in of_photos(source):
-        expected, found = refused(samples, 1), told(samples)
+        expected, found = error_of(samples.__getitem__, 1), told(samples)
         if expected is None or found is not None:
             assert type(found) is type(expected) and str(found) == str(expected)
         else:
@@ -118,21 +113,15 @@ def test_all_faults_are_listed_at_once(tmp_path):
     for k in range(13):
         CHANGES[kinds[k % 5]](source.file(k))
     of_lenses, calibrated = of_photos(source)
-    with pytest.raises(BrokenImageError) as error:
-        check_files({"photos": of_lenses})
-    first, *lines = str(error.value).splitlines()
-    assert first == "11 of 20 pictures cannot be used:" and len(lines) == 11
+    photos, said = {"photos": of_lenses}, "11 of 20 pictures cannot be used:"
+    first, *lines = refused(said, check_files, photos, error=BrokenImageError).splitlines()
+    assert first == said and len(lines) == 11 and lines[-1] == "  and 1 more"
     assert all(str(source.file(k)) in "".join(lines) for k in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11))
-    assert lines[-1] == "  and 1 more"
-    with pytest.raises(ValueError, match=r"13 of 20 .*\n(.*\n){10}  and 3 more$") as error:
-        check_files({"photos": calibrated})
-    assert "the calibration is for 40×30" in str(error.value)
-    *others, calibrated = of_photos(source, skip_broken=True)
-    assert check_files({str(k): part for k, part in enumerate(others)}) == {
-        str(k): 11 for k in range(len(others))
-    }
-    with pytest.raises(ValueError, match="2 of 20 pictures cannot be used"):
-        check_files({"photos": calibrated})
+    said = r"13 of 20 .*\n(.*\n){10}  and 3 more$"
+    assert "the calibration is for 40×30" in refused(said, check_files, {"photos": calibrated})
+    of_lenses, calibrated = of_photos(source, skip_broken=True)
+    assert check_files({"a": of_lenses}) == {"a": 11}
+    refused("2 of 20 pictures cannot be used", check_files, {"photos": calibrated})
 
 
 def test_headers_alone_are_read(tmp_path, monkeypatch):
@@ -164,41 +153,72 @@ def test_headers_alone_are_read(tmp_path, monkeypatch):
     assert len(decoded) == 8
 
 
+def of_another_size(file):
+    file.write_text(LENS.replace("30", "50"))
+
+
+LABELS = np.zeros((121, 160), np.uint8)
+METRES = np.ones((121, 160), np.float32)
+
+
+def saving(array):
+    return lambda file: np.save(file, array, allow_pickle=True)
+
+
+def writing(array, bits=8):
+    return lambda file: file.write_bytes(png(array, bits))
+
+
 @pytest.mark.parametrize(
-    ("target", "name", "change"),
+    ("name", "change", "said"),
     [
-        ("labels", "images/001.png", CHANGES["empty"]),
-        ("labels", "images/001.png", CHANGES["another shape"]),
-        ("labels", "images/001.png", turned),
-        ("labels", "labels/001.png", lambda f: write(f, np.ones((9, 9), np.uint8))),
-        ("labels", "labels/001.png", CHANGES["cut in the middle"]),
-        ("labels", "labels/001.png", CHANGES["missing"]),
-        ("distance", "distance/001.png", lambda f: write(f, np.ones((9, 9), np.uint16))),
-        ("distance", "distance/001.png", CHANGES["cut at the end"]),
-        ("distance", "distance/001.npy", lambda f: np.save(f, np.ones((9, 9), np.float32))),
-        ("distance", "distance/001.npy", lambda f: np.save(f, np.ones((121, 160), int))),
-        ("distance", "distance/001.npy", lambda f: np.savez(f.open("wb"), np.ones((121, 160)))),
-        ("distance", "distance/001.npy", CHANGES["empty"]),
-        ("distance", "distance/001.npy", cut(0.5)),
-        ("labels", "lens.json", lambda f: f.write_text(LENS.replace("30", "50"))),
-        ("labels", "lenses/001.json", lambda f: f.write_text(LENS.replace("30", "50"))),
+        ("images/001.png", CHANGES["empty"], "cannot read"),
+        ("images/001.png", CHANGES["another shape"], r"images/001\.png.* 30×30"),
+        ("images/001.png", turned, "has the EXIF orientation 6"),
+        ("labels/001.png", writing(LABELS[:-1]), r"has 120×160 px, .*images/001\.png has 121×160"),
+        ("labels/001.png", CHANGES["empty"], "cannot read"),
+        ("labels/001.png", CHANGES["cut in the middle"], "cannot read"),
+        ("labels/001.png", CHANGES["missing"], "cannot read"),
+        ("distance/001.png", writing(LABELS[:-1], 16), "has 120×160 px, "),
+        ("distance/001.png", CHANGES["missing"], "cannot read"),
+        ("distance/001.png", CHANGES["cut at the end"], "cannot read"),
+        ("distance/001.npy", saving(METRES[:-1]), "has 120×160 px, "),
+        ("distance/001.npy", saving(METRES[None]), r"\(H, W\), but holds float32 \(1,"),
+        ("distance/001.npy", saving(LABELS.astype(int)), "but holds int64"),
+        ("distance/001.npy", saving(np.array([[{}]])), "cannot read"),
+        ("distance/001.npy", lambda file: np.savez(file.open("wb"), METRES), "holds an archive"),
+        ("distance/001.npy", CHANGES["empty"], "cannot read"),
+        ("distance/001.npy", CHANGES["cut in the middle"], "cannot read"),
+        ("lens.json", of_another_size, "the calibration is for"),
+        ("lenses/001.json", of_another_size, "the calibration is for"),
     ],
 )
-def test_scenes(tmp_path, target, name, change):
+def test_scenes(tmp_path, name, change, said):
     write_plain(tmp_path, 10, own_lenses="lenses" in name)
+    target = "distance" if name.startswith("distance") else "labels"
     if name.endswith("npy"):
         (tmp_path / "distance" / "001.png").unlink()
-        np.save(tmp_path / name, np.ones((121, 160), np.float32))
+        np.save(tmp_path / name, METRES)
     samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
     check_files({"scenes": samples})
     change(tmp_path / name)
     if name.startswith("lens"):  # lenses are read once
         samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
-    expected, found = refused(samples, 1), told(samples)
-    assert expected is not None and type(found) is type(expected)
+    expected, found = error_of(samples.__getitem__, 1), told(samples)
+    assert re.search(said, str(expected)) and type(found) is type(expected)
     assert str(expected) in str(found) and samples.broken == []
+    assert name.startswith("lens") or str(tmp_path / name) in str(expected)
     skipping = SceneSamples(samples.scenes, size=16, skip_broken=True)
-    assert (told(skipping) is None) == isinstance(expected, BrokenImageError)
+    if isinstance(expected, ValueError):  # a wrong target is not skipped as if its file were broken
+        assert isinstance(told(skipping), ValueError)
+        refused(said, skipping.__getitem__, 1)
+    else:
+        assert told(skipping) is None
+        image, lens, nothing = skipping[1]
+        assert (nothing == (IGNORE if target == "labels" else 0)).all()
+        assert nothing.dtype == (torch.int64 if target == "labels" else torch.float32)
+        assert lens.image_size.tolist() == [[16, 16]] and image.unique().numel() == 3
+        assert skipping.broken == [1]
 
 
 def test_some_labels_are_read(tmp_path):
@@ -208,11 +228,9 @@ def test_some_labels_are_read(tmp_path):
         palette = [[2, 2, 2], [1, 1, 1], [9, 9, 9]]
         file.write_bytes(png(np.full((121, 160), k == 6, np.uint8) * 2, 2, PALETTE, palette))
     samples = SceneSamples(open_scenes(tmp_path, "all", "labels"), size=16)
-    with (
-        pytest.warns(OddLabels) as warned,
-        pytest.raises(ValueError, match=r"006\.png holds the ids \[9\], but the 3 classes"),
-    ):
-        check_files({"scenes": samples})
+    with pytest.warns(OddLabels) as warned:
+        said = r"006\.png holds the ids \[9\], but the 3 classes"
+        refused(said, check_files, {"scenes": samples})
     assert len(warned) == 1
 
 
@@ -226,8 +244,7 @@ def test_a_fault_that_headers_hide_makes_all_files_be_read(tmp_path):
     parts = {
         name: SceneSamples(open_scenes(tmp_path / name, "all", "labels"), size=16) for name in "ab"
     }
-    with pytest.raises(ValueError, match=r"^16 of 32 pictures cannot be used:(?s:.*)and 6 more$"):
-        check_files(parts)
+    refused(r"^16 of 32 pictures cannot be used:(?s:.*)and 6 more$", check_files, parts)
 
 
 def test_pictures_in_memory_have_no_files():

@@ -5,10 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from frames import WOODSCAPE, write_frames
+from helpers import refused
 from runs import DIGITS, QUIET, assert_same, checkpoint, error, fit, killed_fit, test
 from safetensors.torch import load_file
 
 from darswin import create_model
+from darswin.lens import Equidistant, save
 from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.train.classification import Classification
 from darswin.train.finetuning import (
@@ -54,9 +56,7 @@ def test_fine_tuning_beats_a_fresh_start(tmp_path):
         "--trainer.max_epochs", "12")  # fmt: skip
     # Other digits, of another camera. After 3 epochs the lead is within the seeds' span.
     lens = tmp_path / "lens.json"
-    lens.write_text(
-        '{"model": "Equidistant", "focal": 38.0, "theta_max": 1.5, "image_size": [121, 160]}'
-    )
+    save(Equidistant(38.0, 1.5, image_size=(121, 160)), lens)
     others = [
         *("--data.path", write_frames(tmp_path / "others", lens, 600, classes="1234567")),
         *("--data.lens", lens, "--data.batch_size", "16", "--data.holdout", "0.4"),
@@ -92,7 +92,7 @@ def test_the_head_stays_with_its_classes(whole, labelled, scenes, tmp_path):
 
 
 def test_a_classifier_gives_its_encoder(classifier, scenes, tmp_path):
-    options = ["--data.path", scenes, "--data.batch_size", "4", *QUIET, *STILL]
+    options = ["--data.path", scenes, "--data.limit", "8", "--data.batch_size", "4", *QUIET, *STILL]
     run = tmp_path / "run"
     fit(run, "--task", "segmentation", *options, "--model.weights", classifier)
     before, after = load_file(classifier), weights_of(run)
@@ -112,10 +112,12 @@ def test_a_classifier_gives_its_encoder(classifier, scenes, tmp_path):
 def test_a_resumed_run_does_not_read_the_weights_again(classifier, scenes, tmp_path, monkeypatch):
     weights = tmp_path / "m.safetensors"
     weights.write_bytes(classifier.read_bytes())
-    start = ["--task", "segmentation", "--data.path", scenes, "--data.limit", "16", *QUIET]
-    start += ["--data.batch_size", "4", "--trainer.max_epochs", "2", "--checkpoint_steps", "1"]
-    start += ["--model.weights", weights, "--model.freeze_stages", "1"]
-    start += ["--model.learning_rate", "1e-2", "--model.reference_batch", "8"]
+    start = [
+        *("--task", "segmentation", "--data.path", scenes, "--data.limit", "16", *QUIET),
+        *("--data.batch_size", "4", "--trainer.max_epochs", "2", "--checkpoint_steps", "1"),
+        *("--model.weights", weights, "--model.freeze_stages", "1"),
+        *("--model.learning_rate", "1e-2", "--model.reference_batch", "8"),
+    ]
     fit(tmp_path / "whole", *start)
     run = tmp_path / "killed"
     killed_fit(monkeypatch, run, 6, *start)
@@ -134,9 +136,8 @@ def test_a_resumed_run_does_not_read_the_weights_again(classifier, scenes, tmp_p
 
 
 def test_all_stages_frozen_train_the_head_alone(classifier):
-    net = load_model(classifier)[0].requires_grad_(True)
     task = Classification("darswin_a_nano", weights=str(classifier), freeze_stages=3)
-    task.net = net
+    task.net = net = load_model(classifier)[0].requires_grad_(True)
     task._freeze()
     names = {name for name, p in net.named_parameters() if p.requires_grad}
     assert names == {"head.weight", "head.bias"}
@@ -145,17 +146,16 @@ def test_all_stages_frozen_train_the_head_alone(classifier):
     assert {name for name, m in net.named_children() if m.training} <= {"head", "stages"}
 
 
+HEAD = {"stages", "norm", "head"}
+
+
 @pytest.mark.parametrize(
     ("card", "stages", "parts"),
     [
-        (ModelCard("darswin_ra_nano"), 1, {"stages", "norm", "head"}),
-        (ModelCard("swin_nano", {"image_size": 32}), 1, {"stages", "norm", "head"}),
-        (
-            ModelCard("swin_nano", {"image_size": 32, "view": "mercator"}),
-            1,
-            {"stages", "norm", "head"},
-        ),
-        (ModelCard("dat_nano", {"image_size": 32}), 1, {"stages", "norm", "head"}),
+        (ModelCard("darswin_ra_nano"), 1, HEAD),
+        (ModelCard("swin_nano", {"image_size": 32}), 1, HEAD),
+        (ModelCard("swin_nano", {"image_size": 32, "view": "mercator"}), 1, HEAD),
+        (ModelCard("dat_nano", {"image_size": 32}), 1, HEAD),
         (ModelCard("darswin_unet_a_nano", SMALL), 3, {"decoder", "places", "segmentation_head"}),
     ],
 )
@@ -167,8 +167,8 @@ def test_a_model_freezes_what_stands_before_its_stages(card, stages, parts):
     of_net = getattr(net, "encoder", net).stages
     assert all(id(p) in frozen for p in of_net[0].parameters())
     for wrong in (-1, len(of_net) + 1):
-        with pytest.raises(ValueError, match=f"the model's {len(of_net)} stages, got {wrong}"):
-            frozen_parts(net, wrong)
+        said = f"the model's {len(of_net)} stages, got {wrong}"
+        refused(said, frozen_parts, net, wrong)
 
 
 def test_options_not_given_are_the_model_s():
@@ -182,11 +182,9 @@ def test_options_not_given_are_the_model_s():
     assert model["name"] == "darswin_unet_a_nano" and data["channels"] == 1
     # The Unet of this size has other depths.
     assert model["options"] == {"depths": (1, 2, 1), "spacing": "tan", "typical_distance": 3.0}
-    net = create_model(model["name"], task="distance", **model["options"])
-    assert (
-        net.encoder.state_dict().keys()
-        == create_model(CARD.model, num_classes=0).state_dict().keys()
-    )
+    encoder = create_model(model["name"], task="distance", **model["options"]).encoder
+    classifier = create_model(CARD.model, num_classes=0)
+    assert encoder.state_dict().keys() == classifier.state_dict().keys()
 
 
 SQUARE = replace(CARD, options={**CARD.options, "image_size": 32})
@@ -205,8 +203,8 @@ SQUARE = replace(CARD, options={**CARD.options, "image_size": 32})
 )
 def test_options_that_disagree_are_named(card, task, model, data, message):
     model = dict(name=None, options=None) | model
-    with pytest.raises(ValueError, match=f"^{message}.* disagrees with `weights` w, whose model"):
-        settle(card, "w", task, model, NONE | data)
+    said = f"^{message}.* disagrees with `weights` w, whose model"
+    refused(said, settle, card, "w", task, model, NONE | data)
 
 
 def test_which_model_starts_from_which():
@@ -214,20 +212,17 @@ def test_which_model_starts_from_which():
     for name, dense in classifiers.items():
         assert name_from(ModelCard(name), "distance") == dense
         assert name_from(ModelCard(dense, task="distance"), "segmentation") == dense
-    for card, task in (
-        (ModelCard("dat_nano"), "segmentation"),
-        (ModelCard("swin_unet_nano", task="segmentation"), "classification"),
-    ):
-        with pytest.raises(ValueError, match=rf"no model for {task} can start from a {card.model}"):
-            name_from(card, task)
+    dense = ModelCard("swin_unet_nano", task="segmentation")
+    for card, task in ((ModelCard("dat_nano"), "segmentation"), (dense, "classification")):
+        said = rf"no model for {task} can start from a {card.model}"
+        refused(said, name_from, card, task)
     check_name("swin_unet_nano", "distance")
-    with pytest.raises(ValueError, match="no model for `task` classification; did you mean "):
-        check_name("swin_unet_nano", "classification")
+    said = "no model for `task` classification; did you mean "
+    refused(said, check_name, "swin_unet_nano", "classification")
 
 
 def test_weights_that_start_nothing(classifier, tmp_path, capsys):
-    with pytest.raises(FileNotFoundError, match="there is no model in"):
-        weights_file(tmp_path)
+    refused("there is no model in", weights_file, tmp_path, error=FileNotFoundError)
     start = ["fit", "--run", tmp_path / "run", *DIGITS, "--model.name", "darswin_a_micro"]
     message = error(capsys, *start, "--model.weights", classifier)
     assert "--model.name darswin_a_micro disagrees with --model.weights" in message
@@ -236,5 +231,5 @@ def test_weights_that_start_nothing(classifier, tmp_path, capsys):
     save_model(tmp_path / "b.safetensors", other.create().state_dict(), other)
     larger = ModelCard("darswin_unet_a_nano", {**SMALL, "embed_dim": 16})
     for card, weights in ((CARD, tmp_path / "b.safetensors"), (larger, classifier)):
-        with pytest.raises(ValueError, match="holds the weights of another model"):
-            start_from(card.create(), ["a", "b"], weights)
+        said = "holds the weights of another model"
+        refused(said, start_from, card.create(), ["a", "b"], weights)

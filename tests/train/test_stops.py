@@ -3,8 +3,10 @@
 import csv
 import os
 import signal
+from contextlib import nullcontext
 
 import pytest
+from helpers import slow_but
 from runs import DIGITS, assert_same, checkpoint, fit, patch_batch
 
 from darswin.train.classification import Classification
@@ -16,19 +18,12 @@ CASES = {
     "accumulated": [],
     "validated within epochs": ["--trainer.val_check_interval", "5"],
     "validated between steps": ["--trainer.val_check_interval", "4"],
-    "validated across epochs": [
-        *("--trainer.val_check_interval", "10", "--trainer.check_val_every_n_epoch", "null"),
-    ],
+    "validated across epochs": [*("--trainer.val_check_interval", "10"),
+                                *("--trainer.check_val_every_n_epoch", "null")],
     "validated rarely": ["--trainer.check_val_every_n_epoch", "2"],
     "cut epochs": ["--trainer.limit_train_batches", "7", "--data.workers", "1"],
     "one step": ["--trainer.accumulate_grad_batches", "12", "--checkpoint_steps", "5"],
-}
-slow = pytest.mark.slow
-STOPS = [
-    (name, how, *(() if (name, how) == ("validated within epochs", "steps") else (slow,)))
-    for name in CASES
-    for how in ("steps", "time", "signal")
-]
+}  # fmt: skip
 
 
 def validations(run):
@@ -78,9 +73,8 @@ def wholes(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "how"), [pytest.param(case, how, marks=marks) for case, how, *marks in STOPS]
-)
+@pytest.mark.parametrize("how", ["steps", "time", "signal"])
+@pytest.mark.parametrize("case", CASES)
 def test_a_run_that_stops_at_every_step_ends_as_a_whole_one(
     wholes, tmp_path, monkeypatch, case, how
 ):
@@ -108,7 +102,7 @@ def early(tmp_path, patience):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("every", [4, pytest.param(5, marks=slow), pytest.param(12, marks=slow)])
+@pytest.mark.parametrize("every", [4, 5, 12])
 def test_early_stopping_ends_a_whole_step(wholes, tmp_path, every):
     """Validations after 4 and 8 of 12 batches are amid a step of 5."""
     run = tmp_path / "run"
@@ -131,10 +125,8 @@ def test_a_least_number_of_epochs_holds_against_time_and_not_against_signals(tmp
     assert checkpoint(tmp_path / "signal")["global_step"] == 1
 
 
-@pytest.mark.parametrize("how", ["signal", pytest.param("time", marks=slow)])
-def test_a_stop_during_a_validation(wholes, tmp_path, monkeypatch, how):
-    run, whole = tmp_path / "run", wholes("accumulated")
-
+@pytest.mark.parametrize("how", slow_but(["signal", "time"], "signal"))
+def test_a_stop_during_a_validation(whole, tmp_path, monkeypatch, how):
     def act(module, *batch):
         if how == "time":
             want_a_stop(module)
@@ -142,15 +134,11 @@ def test_a_stop_during_a_validation(wholes, tmp_path, monkeypatch, how):
             os.kill(os.getpid(), signal.SIGINT)
         return step(module, *batch)
 
-    step = Classification.validation_step
-    with monkeypatch.context() as patch:
+    run, step = tmp_path / "run", Classification.validation_step
+    stops = pytest.raises(SystemExit, match="130") if how == "signal" else nullcontext()
+    with monkeypatch.context() as patch, stops:
         patch.setattr(Classification, "validation_step", act)
-        if how == "signal":
-            with pytest.raises(SystemExit) as end:
-                fit(run, *DIGITS, *STEADY)
-            assert end.value.code == 130
-        else:
-            fit(run, *DIGITS, *STEADY)
+        fit(run, *DIGITS)
     assert checkpoint(run)["global_step"] == 3  # of 6: the epoch's
     fit(run, "--resume")
     assert_same(run, whole)

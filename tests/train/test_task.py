@@ -1,4 +1,5 @@
-"""Parts of tasks and runs that need no run: optimiser, metrics, devices, checkpoints, options."""
+"""Parts of tasks and runs that need no run: optimiser, metrics, results, data, devices, checkpoints
+and options."""
 
 from types import SimpleNamespace
 
@@ -8,8 +9,10 @@ import torch
 import torch.nn.functional as F
 import yaml
 from frames import WOODSCAPE, write_frames
+from helpers import refused
 from runs import DIGITS, error
 from scenes import write, write_plain
+from scipy.stats import binomtest
 from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 from torchmetrics.classification import MulticlassAccuracy
@@ -18,10 +21,11 @@ from darswin import create_model, lens
 from darswin.cli.options import PRESETS
 from darswin.data.framing import CutOff
 from darswin.models.saving import ModelCard
-from darswin.train.classification import Classification, ClassMetrics
+from darswin.train.classification import Classification, ClassMetrics, wilson
 from darswin.train.data import WideAngleData
 from darswin.train.distance import DistanceData
-from darswin.train.runs import BestCheckpoint, check_changes
+from darswin.train.results import WriteResults
+from darswin.train.runs import BestCheckpoint
 from darswin.train.segmentation import LabelData, Segmentation
 from darswin.train.task import Schedule, parameter_groups
 
@@ -95,6 +99,61 @@ def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
     assert {*ClassMetrics(5).all()} == {"top1", "loss"} and "top5" in ClassMetrics(6).all()
 
 
+# -- results of tests -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("right", "n"), [(0, 1), (1, 1), (7, 12), (96, 96), (0, 40), (500, 1000)])
+def test_the_interval_is_wilson_s(right, n):
+    expected = binomtest(right, n).proportion_ci(0.95, "wilson")
+    assert wilson(right / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+@pytest.fixture
+def tested(tmp_path, capsys, monkeypatch):
+    """A function: labels and the share of right answers of each test set → the task, and what is
+    printed of its results."""
+
+    def make(sets):
+        task = Classification("darswin_a_nano")
+        task.card = task.trained = ModelCard("darswin_a_nano", {}, list("abc"), 32, 2.8)
+        data = SimpleNamespace(test_names=list(sets), train_lenses=None)
+        monkeypatch.setattr(Classification, "data", data)
+        task.test_metrics = torch.nn.ModuleList(ClassMetrics(3) for _ in sets)
+        for metrics, (labels, right) in zip(task.test_metrics, sets.values(), strict=True):
+            truth = torch.tensor(labels, dtype=torch.int64)
+            answers = (truth + (torch.arange(len(truth)) >= right)) % 3
+            metrics.update(torch.nn.functional.one_hot(answers, 3).float(), truth)
+        task.on_test_epoch_end()
+        WriteResults(tmp_path).on_test_end(None, task)
+        return task.results, capsys.readouterr().out, task.results_figure()
+
+    return make
+
+
+def test_a_test_says_how_many_pictures_and_how_sure_it_is(tested):
+    labels = [0] * 14 + [1] * 6 + [2] * 4
+    rows, said, figure = tested({"0": (labels, 20), "0.5": (labels, 14)})
+    assert [row["n"] for row in rows] == [24, 24]
+    assert rows[0]["most_frequent"] == pytest.approx(14 / 24)
+    assert (rows[0]["top1_low"], rows[0]["top1_high"]) == pytest.approx(wilson(20 / 24, 24))
+    heads, first, second = said.strip().splitlines()[:3]
+    for word in ("n", "top1 (%)", "95 % interval", "most frequent class (%)"):
+        assert word in heads
+    assert "64.1–93.3" in first and "58.33" in second and "24" in first
+    assert "On 0.5, the accuracy is not certainly above that of always" in said
+    axes = figure.axes[0]
+    assert axes.get_title() == "n = 24"
+    names = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert {"95 % interval", "most frequent class"} <= {*names}
+
+
+def test_other_test_sets_are_bars_and_may_be_empty(tested):
+    rows, said, figure = tested({"polynomial": ([0, 1, 2] * 20, 60), "low": ([], 0)})
+    assert rows[1]["n"] == 0 and rows[1]["loss"] is rows[1]["top1_low"] is None
+    assert "certainly" not in said
+    assert figure.axes[0].get_title() == "n = 0–60"
+
+
 # -- data -------------------------------------------------------------------------------------
 
 
@@ -117,7 +176,8 @@ def test_pictures_decide_on_size_and_channels(tmp_path, side, options, size):
 
 
 def test_lens_augmentation_is_for_training():
-    data = WideAngleData("digits", train_lenses="0", lens_augmentation="0.5..1", workers=0)
+    options = dict(train_lenses="0", lens_augmentation="0.5..1", workers=0, limit=32)
+    data = WideAngleData("digits", batch_size=32, render=32, **options)
     _, lenses, _ = next(iter(data.train_dataloader()))
     assert lenses.xi.min() >= 0.5 and lenses.xi.max() - lenses.xi.min() > 0.3
     assert data.dataset("val")[0][1].xi == 0
@@ -127,20 +187,20 @@ def test_a_crop_is_told_once(tmp_path, recwarn):
     """For pictures of a camera if it is asked for, and for others by default."""
     write_plain(tmp_path / "scenes", 6)
     write_frames(tmp_path / "frames", count=40, classes="01")
-    frames, lens = str(tmp_path / "frames"), str(WOODSCAPE)
-    for make, fit in (
-        (lambda **o: LabelData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
-        (lambda **o: DistanceData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
-        (lambda **o: WideAngleData(frames, lens=lens, workers=0, **o), "stretch"),
-        (lambda **o: WideAngleData(frames, test_lenses="0", workers=0, **o), "crop"),
+    scenes, frames = str(tmp_path / "scenes"), str(tmp_path / "frames")
+    for kind, path, own, fit in (
+        (LabelData, scenes, {}, "stretch"),
+        (DistanceData, scenes, {}, "stretch"),
+        (WideAngleData, frames, {"lens": str(WOODSCAPE)}, "stretch"),
+        (WideAngleData, frames, {"test_lenses": "0"}, "crop"),
     ):
         for options in ({}, {"fit": "crop"}, {"fit": "stretch"}):
-            data = make(batch_size=1, **options)
+            data = kind(path, workers=0, batch_size=1, **own, **options)
             assert data.fit == options.get("fit", fit)
             recwarn.clear()
             for loader in (data.train_dataloader(), data.val_dataloader(), *data.test_dataloader()):
                 next(iter(loader))
-            said = [str(one.message) for one in recwarn if one.category is CutOff]
+            said = [str(warning.message) for warning in recwarn if warning.category is CutOff]
             assert len(said) == (data.fit == "crop")
             for text in said:
                 assert text.startswith("`fit` crop cuts off 19 px at the left and 20 px at the rig")
@@ -211,36 +271,18 @@ def test_a_checkpoint_of_another_model_is_refused():
         ({"fov": 2.0}, "fov 2.0 there, 2.8 here"),
         ({"classes": list("abce")}, "classes"),
     ):
-        with pytest.raises(ValueError, match=f"belongs to another model: {said}"):
-            task.on_load_checkpoint({"darswin": ours | other})
+        said = f"belongs to another model: {said}"
+        refused(said, task.on_load_checkpoint, {"darswin": ours | other})
 
 
 # -- options ----------------------------------------------------------------------------------
-
-
-def test_changes_are_named():
-    before = {"data": {"size": 32, "workers": 1}, "trainer": {"devices": 1}, "run": "a"}
-    now = {"data": {"size": 32, "workers": 2}, "trainer": {"devices": 2}, "run": "b"}
-    assert check_changes(before, before) == {}
-    assert check_changes(before, now) == {
-        "data.workers": "2 in place of 1", "trainer.devices": "2 in place of 1",
-    }  # fmt: skip
-    for name, value in (("data.size", 64), ("trainer.accumulate_grad_batches", 4),
-                        ("model.name", "b"), ("data.limit", 9)):  # fmt: skip
-        group, _, option = name.partition(".")
-        changed = now | {group: now.get(group, {}) | {option: value}}
-        with pytest.raises(
-            ValueError, match=f"cannot change these options: `{name}` {value!r} in place of [^;]*$"
-        ):
-            check_changes(before, changed)
 
 
 @pytest.mark.parametrize("kind", [Classification, Segmentation])
 def test_one_class_is_not_enough(kind):
     task = kind()
     task._trainer = SimpleNamespace(datamodule=SimpleNamespace(classes=["a"]))
-    with pytest.raises(ValueError, match=r"needs at least two classes, but the data has \['a'\]"):
-        task._head_options()
+    refused(r"needs at least two classes, but the data has \['a'\]", task._head_options)
     task.data.classes += ["b"]
     assert task._head_options()["num_classes"] == 2
 
@@ -266,5 +308,4 @@ def test_one_class_is_not_enough(kind):
     ],
 )  # fmt: skip
 def test_wrong_options_are_named(make, message):
-    with pytest.raises((ValueError, OSError), match=message):
-        make()
+    refused(message, make, error=(ValueError, OSError))

@@ -1,6 +1,7 @@
 """Labels that move with their pictures: the oracle is what the new picture shows."""
 
 import math
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -60,11 +61,10 @@ def test_labels_follow_the_picture(way, form):
     """The thing is white in a black picture. The new picture shows where it is."""
     outline = blob((150, 115), 40)
     mask = filled([outline])
-    thing = Thing(7, box_of(outline), **{
-        "polygon": {"polygons": [outline]}, "mask": {"rle": encode_rle(mask)}, "box": {},
-    }[form])  # fmt: skip
+    shape = dict(polygon={"polygons": [outline]}, mask={"rle": encode_rle(mask)}, box={})[form]
     image = np.repeat(mask[..., None] * np.uint8(255), 3, 2)
-    sample = Sample(image, Labels([thing], SIZE), LENS).through(WAYS[way])
+    labels = Labels([Thing(7, box_of(outline), **shape)], SIZE)
+    sample = Sample(image, labels, LENS).through(WAYS[way])
     assert isinstance(sample.target, Labels)
     (found,), size, lost = sample.target
     assert size == sample.image.shape[:2] and lost == 0 and found.category == 7
@@ -94,21 +94,16 @@ def cropped(*part):
 
 def test_what_leaves_the_picture():
     """Crops of 100 px: things are cut at the border, and left out below a fifth."""
-    outlines = [square(x, 50) for x in (-10, 85, 94, 97, 300)]
-    polygons = [Thing(k, box_of(one), [one]) for k, one in enumerate(outlines)]
-    boxes = [Thing(k, box_of(one)) for k, one in enumerate(outlines)]
-    masks = [
-        Thing(k, box_of(one), rle=encode_rle(filled([np.clip(one, 0, 319)])))
-        for k, one in enumerate(outlines)
-    ]
-    for things in (polygons, masks):
+    outlines = [*enumerate(square(x, 50) for x in (-10, 85, 94, 97, 300))]
+    polygons = [Thing(k, box_of(outline), [outline]) for k, outline in outlines]
+    boxes = [Thing(k, box_of(outline)) for k, outline in outlines]
+    masks = [encode_rle(filled([np.clip(outline, 0, 319)])) for _, outline in outlines]
+    masks = [Thing(k, box_of(outline), rle=masks[k]) for k, outline in outlines]
+    # A mask ends at the picture.
+    for things, first in ((polygons, 0.5), (masks, 1.0)):
         found = moved(Labels(things, SIZE, lost=3), cropped(0, 0, 100, 100))
-        want = {0: 0.5, 1: 0.75, 2: 0.3}
-        if things is masks:
-            want[0] = 1.0  # a mask ends at the picture
-        assert {t.category: round(t.visible, 2) for t in found.things} == pytest.approx(
-            want, abs=0.03
-        )
+        visible = {thing.category: round(thing.visible, 2) for thing in found.things}
+        assert visible == pytest.approx({0: first, 1: 0.75, 2: 0.3}, abs=0.03)
         assert found.lost == 3 + 2 and found.size == (100, 100)
         for thing in found.things:
             assert (thing.box >= 0).all() and (thing.box <= 100).all()
@@ -128,8 +123,7 @@ def test_visible_shares_add_up_over_moves():
 
 
 def test_two_parts_and_no_things():
-    parts = [square(10, 10), square(60, 10)]
-    whole = Thing(1, np.array([10.0, 10, 80, 30]), parts)
+    whole = Thing(1, np.array([10.0, 10, 80, 30]), [square(10, 10), square(60, 10)])
     (found,) = moved(Labels([whole], SIZE), cropped(0, 0, 100, 50)).things
     assert found.visible == pytest.approx(0.5) and len(found.polygons) == 1
     assert found.area == pytest.approx(400)
@@ -147,49 +141,40 @@ def test_keypoints():
     )
 
 
-class Shifted:
-    """A view all around of 100 px: what leaves it on one side is on the other."""
-
-    view_size, mirrored = (80, 100), False
-
-    def to_view(self, points):
-        return np.stack(((points[..., 0] + 30.5) % 100 - 0.5, points[..., 1]), -1)
-
-    def target(self, target):
-        return np.roll(target, 30, 1)[: self.view_size[0]]
+# A view all around of 100 px: what leaves it on one side is on the other.
+SHIFTED = SimpleNamespace(
+    view_size=(80, 100),
+    mirrored=False,
+    to_view=lambda points: np.stack(((points[..., 0] + 30.5) % 100 - 0.5, points[..., 1]), -1),
+    target=lambda target: np.roll(target, 30, 1)[:80],
+)
+# Nothing is seen beyond the column 49.
+HALF = SimpleNamespace(
+    view_size=(80, 100),
+    mirrored=False,
+    to_view=lambda points: np.where(points[..., :1] <= 49.5, points, np.nan),
+)
 
 
 @pytest.mark.parametrize("form", ["polygon", "box"])
 def test_a_thing_at_the_seam_of_a_view_keeps_its_larger_part(form):
     outline = square(57, 20)
     thing = Thing(1, box_of(outline), [outline] if form == "polygon" else [])
-    (found,) = moved(Labels([thing], (80, 100)), Shifted()).things
+    (found,) = moved(Labels([thing], (80, 100)), SHIFTED).things
     np.testing.assert_allclose(found.box, [87, 20, 100, 40], atol=4 if form == "polygon" else 1)
     assert found.visible == pytest.approx(13 / 20, abs=0.1)
 
 
-class Half:
-    """Nothing is seen beyond the column 49."""
-
-    view_size, mirrored = (80, 100), False
-
-    def to_view(self, points):
-        return np.where(points[..., :1] <= 49.5, points, np.nan)
-
-
 def test_a_thing_that_is_partly_unseen():
     outline = square(40, 20)
-    (found,) = moved(Labels([Thing(1, box_of(outline), [outline])], (80, 100)), Half()).things
+    (found,) = moved(Labels([Thing(1, box_of(outline), [outline])], (80, 100)), HALF).things
     np.testing.assert_allclose(found.box, [40, 20, 50, 40], atol=2)
     assert found.visible == pytest.approx(0.5, abs=0.1)
     behind = Thing(1, box_of(square(60, 20)))
-    assert moved(Labels([behind, behind], (80, 100)), Half()) == Labels([], (80, 100), 2)
+    assert moved(Labels([behind, behind], (80, 100)), HALF) == Labels([], (80, 100), 2)
 
 
-@given(
-    st.lists(st.tuples(*[st.floats(-50, 350)] * 4), max_size=4),
-    st.sampled_from(sorted(WAYS)),
-)
+@given(st.lists(st.tuples(*[st.floats(-50, 350)] * 4), max_size=4), st.sampled_from(sorted(WAYS)))
 def test_any_boxes_move(corners, way):
     things = [Thing(1, np.array([x, y, x + abs(w), y + abs(h)])) for x, y, w, h in corners]
     found = moved(Labels(things, SIZE), WAYS[way].at(LENS, SIZE))
