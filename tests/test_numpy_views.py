@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+import rigs
 import torch
 from matplotlib.figure import Figure
 
@@ -16,7 +17,6 @@ from darswin.deploy import camera
 from darswin.lens import Equidistant, KannalaBrandt, Polynomial
 from darswin.viz import pixels
 from darswin.viz.plot import draw_polar
-from tests import rigs
 
 RNG = np.random.default_rng(0)
 SIZE = (48, 64)
