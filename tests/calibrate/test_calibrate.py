@@ -56,7 +56,7 @@ def few():
 
 @pytest.mark.parametrize(("model", "fov"), slow_but(
     WIDE + [(model, 60) for model in NARROW],
-    ("BrownConrady", 120), ("OCam", 250), ("Tabulated", 60),
+    ("Equisolid", 250), ("Perspective", 60),
 ))  # fmt: skip
 def test_twenty_pictures_give_every_model(model, fov):
     lens = true_lens(model, fov)
@@ -70,11 +70,10 @@ def test_twenty_pictures_give_every_model(model, fov):
     assert 0.95 * lens.theta_max < found.supported <= lens.theta_max * 1.01
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "fov", "seed"),
+@pytest.mark.parametrize(("model", "fov", "seed"), slow_but(
     [(model, min(FOVS[k % 4], widest), (2, 4)[k % 2]) for k, (model, widest) in enumerate(WIDE)],
-)
+    ("BrownConrady", 60, 2), ("OCam", 120, 4), ("Tabulated", 60, 2),
+))  # fmt: skip
 def test_eight_pictures_give_every_model(model, fov, seed):
     lens = true_lens(model, fov, seed=seed)
     found = of(rig(lens, 8, board(7, 5) if seed == 4 else None, seed=seed), model)
@@ -92,7 +91,7 @@ def test_errors_are_small_in_the_median_of_rigs(fov):
 
 
 def test_exact_corners_give_the_exact_lens_and_poses():
-    true = rig(true_lens("KannalaBrandt", 200), 8, noise=0.0)
+    true = rig(true_lens("KannalaBrandt", 200), 3, noise=0.0)
     found = of(true)
     assert ray_errors(found.lens, true.lens).max() < 1e-4
     assert_close(found.rotations, true.rotations, rtol=0, atol=1e-5)
@@ -103,12 +102,14 @@ def test_exact_corners_give_the_exact_lens_and_poses():
     assert_close(found.theta[seen], angles[seen], rtol=0, atol=1e-5)
 
 
-def test_a_part_of_the_board_is_enough(usual):
-    corners = usual.corners.clone()
-    corners[::2, : len(usual.board) // 2] = math.nan
+def test_a_part_of_a_mirrored_board_is_enough():
+    usual = rig(true_lens("KannalaBrandt", 190), 3, noise=0.05, least=54)
+    corners = usual.corners.reshape(3, 6, 9, 2).flip(2).reshape(3, 54, 2)
+    corners[::2, :27] = math.nan
     corners[1::2, ::3] = math.nan
     found = of(usual._replace(corners=corners))
-    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.06 and found.used.sum() >= 10
+    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.03 and found.used.all()
+    assert [text for text in found.doubts if "mirrored" in text and "in 3" in text]
 
 
 def test_what_does_not_fit_is_named_and_does_no_harm(usual):
@@ -155,13 +156,6 @@ def test_neither_order_nor_unit_of_length_matters(usual, best):
 @pytest.mark.parametrize("terms", [1, 5])
 def test_terms(few, terms):
     assert of(few[0], terms=terms).lens.radial.shape == (1, terms)
-
-
-def test_a_mirrored_board_is_named(usual):
-    corners = usual.corners.reshape(12, 6, 9, 2).flip(2).reshape(12, 54, 2)
-    found = of(usual._replace(corners=corners))
-    assert ray_errors(found.lens, usual.lens, best=True).median() < 0.03
-    assert [text for text in found.doubts if "mirrored" in text and "in 12" in text]
 
 
 def test_it_is_saved_and_described(usual, calibrated, tmp_path):
@@ -224,7 +218,7 @@ def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model, ratio,
 def test_the_ratio_of_a_pixels_sides_is_always_or_never_free():
     lens = true_lens("KannalaBrandt", 180)
     lens = lens.replace(affine=torch.tensor([[[1, 0], [0, 1.03]]], dtype=f64))
-    seen = rig(lens, 15)
+    seen = rig(lens, 8)
     found, square = (of(seen, square_pixels=held) for held in (False, True))
     assert abs(found.lens.affine[0, 1, 1] - 1.03) < 1e-3 and "affine[3]" in found.parameters
     assert ray_errors(found.lens, lens, best=True).median() < 0.03

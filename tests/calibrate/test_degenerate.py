@@ -18,7 +18,7 @@ CORNERS, BOARD, SIZE = TRUE.corners, TRUE.board, TRUE.size
 
 
 @pytest.mark.parametrize(("fov", "one_distance"), slow_but(
-    itertools.product((60, 190), (True, False)), (60, True), (190, False)
+    itertools.product((60, 190), (True, False)), (60, True)
 ))  # fmt: skip
 def test_boards_that_are_parallel_to_the_sensor(fov, one_distance):
     """Without noise; with some, they are a mishap."""
@@ -58,6 +58,7 @@ ERRORS = {
 @pytest.mark.parametrize("case", ERRORS)
 def test_errors(case):
     corners, points, options, words = ERRORS[case]
+    options = {"model": "KannalaBrandt"} | options
     assert "\n" not in refused(words, calibrate, corners, points, SIZE, **options)
 
 
@@ -77,7 +78,7 @@ def test_wrong_sizes():
 
 def test_boards_at_one_distance_blurred_corners_and_few_pictures_are_doubted():
     found = calibrate(CORNERS[:1].expand(4, -1, -1), BOARD, SIZE, "Equidistant")
-    blurred = calibrate(rig(TRUE.lens, 10, noise=2.0).corners, BOARD, SIZE, "KannalaBrandt")
+    blurred = calibrate(rig(TRUE.lens, 3, noise=2.0).corners, BOARD, SIZE, "KannalaBrandt")
     for words, doubts in (
         ("all boards are at one distance", found.doubts),
         ("4 pictures show the board at 1 places, which are few", found.doubts),
@@ -87,8 +88,8 @@ def test_boards_at_one_distance_blurred_corners_and_few_pictures_are_doubted():
 
 
 def test_corners_in_the_middle_only_are_doubted():
-    narrow = rig(true_lens("KannalaBrandt", 190, shift=0.0).with_theta_max(0.6), 12)
-    found = calibrate(narrow.corners, BOARD, SIZE, "KannalaBrandt")
+    narrow = rig(true_lens("Equidistant", 190, shift=0.0).with_theta_max(0.6), 3)
+    found = calibrate(narrow.corners, BOARD, SIZE, "Equidistant")
     assert math.degrees(found.supported) == pytest.approx(math.degrees(0.6), abs=2)
     assert [text for text in found.doubts if text.startswith("corners reach 3")]
 
