@@ -71,18 +71,15 @@ def test_corners_are_found_where_they_are(kind, fov, usual, share):
 
 @pytest.mark.parametrize("kind", ["charuco", "april"])
 def test_a_board_with_markers_keeps_its_numbers_if_seen_in_part_and_is_never_mirrored(kind):
-    board, found_some = BOARDS[kind], 0
-    for picture, true in shots(camera(120, (360, 360)), board, 3, seed=3):
+    board = BOARDS[kind]
+    for picture, true in shots(camera(120, (360, 360)), board, 2, seed=3):
         # A hand lies on a part of the board.
         middle = np.nanquantile(true[:, 0], 0.6)
         covered = picture.copy()
         covered[:, int(middle) :] = 90
         found = find_corners(covered, board)
         assert np.isnan(found[true[:, 0] > middle + 3]).all()
-        if (seen := np.isfinite(found[:, 0])).any():
-            assert np.median(np.linalg.norm(found - true, axis=1)[seen]) < 0.4
-            found_some += 1
-    assert found_some >= 2
+        assert np.nanmedian(np.linalg.norm(found - true, axis=1)) < 0.4
     assert np.isfinite(find_corners(picture, board)).sum() > 20
     assert np.isnan(find_corners(picture[:, ::-1], board)).all()
 
@@ -108,14 +105,14 @@ def test_grids_of_kalibr_are_read(upside_down):
 
 def test_grids_may_begin_with_another_tag():
     known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    drawn = cv2.aruco.GridBoard((4, 3), 60.0, 18.0, known, np.arange(30, 42))
-    picture = cv2.GaussianBlur(drawn.generateImage((354, 276), marginSize=30), (0, 0), 0.7)
-    board = Board.april_grid(4, 3, 60.0, 18.0, first_tag=30)
-    assert [*board.markers] == [*range(30, 42)]
+    drawn = cv2.aruco.GridBoard((2, 2), 60.0, 18.0, known, np.arange(30, 34))
+    picture = cv2.GaussianBlur(drawn.generateImage((198, 198), marginSize=30), (0, 0), 0.7)
+    board = Board.april_grid(2, 2, 60.0, 18.0, first_tag=30)
+    assert [*board.markers] == [*range(30, 34)]
     np.testing.assert_allclose(find_corners(picture, board), board.points + 29.5, atol=1.0)
-    other = Board.april_grid(4, 3, 60.0, 18.0)
+    other = Board.april_grid(2, 2, 60.0, 18.0)
     assert np.isnan(find_corners(picture, other)).all()
-    said = "markers 30 to 41 of APRILTAG_36h11, but the first tag of the board is 0"
+    said = "markers 30 to 33 of APRILTAG_36h11, but the first tag of the board is 0"
     assert shown_instead(picture, other) == said
 
 
@@ -170,7 +167,7 @@ def test_pictures_may_be_grey_coloured_or_turned_and_the_board_never_mirrored(on
 
 
 @pytest.mark.parametrize("damage", slow_but(
-    ["covered", "cut", "no board", "blurred", "another"], "covered", "no board", "blurred"
+    ["covered", "cut", "no board", "blurred", "another"], "cut", "no board", "blurred"
 ))  # fmt: skip
 def test_a_board_that_is_not_there_or_not_whole_is_not_found(one, damage):
     board = Board.chessboard(8, 7, 0.025) if damage == "another" else CHESSBOARD
@@ -273,7 +270,7 @@ def test_pictures_without_a_circle_have_none():
 def test_edges_are_as_wide_as_their_blur():
     widths = []
     for blur in (0.5, 1.0, 2.0):
-        view = camera(90, blur=blur, noise=0.5)
+        view = camera(90, (360, 360), blur=blur, noise=0.5)
         widths.append(edge_width(*next(shots(view, CHESSBOARD, seed=4)), CHESSBOARD))
     assert 1.4 < widths[0] < 2.2 and 2.3 < widths[1] < 3.3 and widths[2] > 3.8
 

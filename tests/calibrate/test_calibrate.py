@@ -56,7 +56,7 @@ def few():
 
 @pytest.mark.parametrize(("model", "fov"), slow_but(
     WIDE + [(model, 60) for model in NARROW],
-    ("Equisolid", 250), ("Perspective", 60),
+    ("Equisolid", 250),
 ))  # fmt: skip
 def test_twenty_pictures_give_every_model(model, fov):
     lens = true_lens(model, fov)
@@ -70,13 +70,15 @@ def test_twenty_pictures_give_every_model(model, fov):
     assert 0.95 * lens.theta_max < found.supported <= lens.theta_max * 1.01
 
 
-@pytest.mark.parametrize(("model", "fov", "seed"), slow_but(
-    [(model, min(FOVS[k % 4], widest), (2, 4)[k % 2]) for k, (model, widest) in enumerate(WIDE)],
-    ("BrownConrady", 60, 2), ("OCam", 120, 4), ("Tabulated", 60, 2),
+@pytest.mark.parametrize(("model", "fov", "seed", "pictures"), slow_but(
+    [("BrownConrady", 60, 2, 3), ("OCam", 120, 4, 3), ("Tabulated", 60, 2, 3),
+     *((model, min(FOVS[k % 4], widest), (2, 4)[k % 2], 8)
+       for k, (model, widest) in enumerate(WIDE))],
+    ("BrownConrady", 60, 2, 3), ("OCam", 120, 4, 3), ("Tabulated", 60, 2, 3),
 ))  # fmt: skip
-def test_eight_pictures_give_every_model(model, fov, seed):
+def test_few_pictures_give_every_model(model, fov, seed, pictures):
     lens = true_lens(model, fov, seed=seed)
-    found = of(rig(lens, 8, board(7, 5) if seed == 4 else None, seed=seed), model)
+    found = of(rig(lens, pictures, board(7, 5) if seed == 4 else None, seed=seed), model)
     assert ray_errors(found.lens, lens, best=True).median() < 0.3
     assert 0.15 < found.sigma < 0.25 and found.used.all()
 
@@ -203,7 +205,6 @@ def test_many_models_find_a_lens_that_one_cannot_show(model, seed, best):
     [(model, *row) for model in ("KannalaBrandt", "Mei", "Perspective")
      for row in ((1.05, "5 % longer"), (0.99, "1 % shorter"), (1.0, None))],
     ("KannalaBrandt", 0.99, "1 % shorter"), ("Perspective", 1.05, "5 % longer"),
-    ("Perspective", 1.0, None),
 ))  # fmt: skip
 def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model, ratio, words):
     true = rig(true_lens(model, 100, seed=3), 12, noise=0.2, seed=3)
@@ -218,7 +219,7 @@ def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model, ratio,
 def test_the_ratio_of_a_pixels_sides_is_always_or_never_free():
     lens = true_lens("KannalaBrandt", 180)
     lens = lens.replace(affine=torch.tensor([[[1, 0], [0, 1.03]]], dtype=f64))
-    seen = rig(lens, 8)
+    seen = rig(lens, 5, noise=0.05)
     found, square = (of(seen, square_pixels=held) for held in (False, True))
     assert abs(found.lens.affine[0, 1, 1] - 1.03) < 1e-3 and "affine[3]" in found.parameters
     assert ray_errors(found.lens, lens, best=True).median() < 0.03
@@ -226,7 +227,7 @@ def test_the_ratio_of_a_pixels_sides_is_always_or_never_free():
 
 
 @pytest.mark.parametrize(("ratio", "square"), slow_but(
-    [(1.01, None), (0.99, False), (1.01, True)], (1.01, None), (0.99, False)
+    [(1.01, None), (0.99, False), (1.01, True)], (1.01, None)
 ))  # fmt: skip
 def test_a_stretched_board_is_found(ratio, square):
     lens = true_lens("KannalaBrandt", 120, seed=1)
@@ -262,8 +263,8 @@ def test_a_bent_board_is_found():
 def test_boards_that_never_turn_cannot_tell_their_ratio_from_that_of_the_pixels():
     lens = true_lens("KannalaBrandt", 60, shift=0.0)
     generator = torch.Generator().manual_seed(0)
-    u = torch.rand(14, 5, generator=generator, dtype=f64) - 0.5
-    rotations = turn(flat(1.2 * u[:, :2] * torch.eye(2)[[0, 1] * 7]))
+    u = torch.rand(8, 5, generator=generator, dtype=f64) - 0.5
+    rotations = turn(flat(1.2 * u[:, :2] * torch.eye(2)[[0, 1] * 4]))
     middle = torch.stack((0.2 * u[:, 2], 0.2 * u[:, 3], 0.45 + 0.2 * u[:, 4]), -1)
     solid = flat(board() - board().mean(0)) * torch.tensor([1, 1.01, 1])
     corners = seen(lens, solid, rotations, middle, 0.05, generator)
@@ -373,6 +374,7 @@ def test_left_out_pictures_that_are_missed_are_doubted(usual, calibrated, times)
     assert len(left_out_doubts(found, usual.corners)) == (times > 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "noise"), [("KannalaBrandt", 0.2), ("Fisheye624", 2.0)])
 def test_too_many_numbers_for_few_pictures_miss_those_left_out(model, noise):
     seen = rig(true_lens("KannalaBrandt", 190).with_theta_max(0.8), 4, noise=noise, least=10)

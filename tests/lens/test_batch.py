@@ -72,14 +72,6 @@ def test_a_lens_is_copied_whole_and_has_contiguous_tensors_however_it_was_made(n
     assert name in repr(lens)
 
 
-def test_strided_parameters_make_contiguous_lenses():
-    table = torch.tensor([[0.3, 300.0, 1.4], [0.9, 320.0, 1.5]], requires_grad=True)
-    lens = Spherical(*table.unbind(1), center=table[:, :2].detach().t().flip(0).t())
-    assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
-    lens.r_max.sum().backward()
-    assert (table.grad[:, 1] != 0).all()  # gradients reach the given tensors
-
-
 def test_a_column_of_coefficients_is_not_many_lenses():
     column = [[0.01], [0.002], [-0.001], [0.0003]]  # the shape of OpenCV's D
     for make in (lambda: KannalaBrandt(300.0, column), lambda: KannalaBrandt([300.0], column)):
