@@ -12,7 +12,7 @@ from calibrate_peers import Given
 from darswin.lens import MODELS, Lens
 
 # The makers of random lenses and rigs are those of the tests.
-sys.path.append(str(Path(__file__).parent.parent / "tests"))
+sys.path.append(str(Path(__file__).parent.parent / "tests" / "calibrate"))
 import rigs
 
 FOVS = (60, 100, 150, 190, 220, 250)  # degrees

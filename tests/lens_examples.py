@@ -13,23 +13,11 @@ import yaml
 from darswin.lens import (
     MODELS,
     BrownConrady,
-    DoubleSphere,
-    EnhancedUnified,
-    Equidistant,
-    Equisolid,
-    FieldOfView,
     Fisheye624,
     KannalaBrandt,
     Lens,
     Mei,
-    OCam,
-    OCamInverse,
-    Orthographic,
-    Perspective,
     Polynomial,
-    Spherical,
-    Stereographic,
-    Tabulated,
     load,
 )
 from darswin.lens.files.load import Calibration
@@ -137,35 +125,32 @@ def example(name: str, generator: torch.Generator, focal: tuple[float, float] = 
     def uniform(low: float, high: float, *shape: int):
         return low + (high - low) * torch.rand(4, *shape, generator=generator, dtype=f64)
 
+    def rising():
+        return torch.nn.functional.pad(uniform(0.01, 0.3, 9).cumsum(1), (1, 0))
+
     focal = uniform(*focal)
     terms = torch.tensor([0.05, 0.01, 0.005, 0.001], dtype=f64)
     radial = uniform(-1, 1, 4) * terms
-    return {
-        "Perspective": lambda: Perspective(focal),
-        "Equidistant": lambda: Equidistant(focal),
-        "Equisolid": lambda: Equisolid(focal),
-        "Stereographic": lambda: Stereographic(focal),
-        "Orthographic": lambda: Orthographic(focal),
-        "FieldOfView": lambda: FieldOfView(uniform(0.05, 3.0), focal),
-        "Spherical": lambda: Spherical(uniform(0, 3), focal),
-        "EnhancedUnified": lambda: EnhancedUnified(uniform(0, 1), uniform(0.3, 3), focal),
-        "DoubleSphere": lambda: DoubleSphere(uniform(-0.8, 1.6), uniform(0, 1), focal),
-        "Polynomial": lambda: Polynomial(focal[:, None] * torch.cat(
+    parameters = {
+        "FieldOfView": lambda: dict(omega=uniform(0.05, 3.0), focal=focal),
+        "Spherical": lambda: dict(xi=uniform(0, 3), focal=focal),
+        "EnhancedUnified": lambda: dict(alpha=uniform(0, 1), beta=uniform(0.3, 3), focal=focal),
+        "DoubleSphere": lambda: dict(xi=uniform(-0.8, 1.6), alpha=uniform(0, 1), focal=focal),
+        "Polynomial": lambda: dict(coefficients=focal[:, None] * torch.cat(
             (torch.ones(4, 1, dtype=f64), uniform(-0.1, 0.1, 3)), 1)),
-        "OCam": lambda: OCam(torch.stack(
+        "OCam": lambda: dict(coefficients=torch.stack(
             (-focal, 0 * focal, uniform(0.1, 0.5) / focal, uniform(-0.1, 0.1) / focal**2,
              uniform(-0.1, 0.1) / focal**3), 1)),
-        "OCamInverse": lambda: OCamInverse(
-            focal[:, None] / 500 * double(*OCAM_INVERSE) * uniform(0.98, 1.02, 1)),
-        "KannalaBrandt": lambda: KannalaBrandt(focal, radial),
-        "Fisheye624": lambda: Fisheye624(focal, radial),
-        "Mei": lambda: Mei(uniform(0, 3), focal, radial[:, :2]),
-        "BrownConrady": lambda: BrownConrady(
-            focal, radial[:, :3], denominator=uniform(-0.1, 0.1, 3)),
-        "Tabulated": lambda: Tabulated(
-            torch.nn.functional.pad(uniform(0.01, 0.3, 9).cumsum(1), (1, 0)),
-            focal[:, None] * torch.nn.functional.pad(uniform(0.01, 0.3, 9).cumsum(1), (1, 0))),
-    }[name]()  # fmt: skip
+        "OCamInverse": lambda: dict(
+            coefficients=focal[:, None] / 500 * double(*OCAM_INVERSE) * uniform(0.98, 1.02, 1)),
+        "KannalaBrandt": lambda: dict(focal=focal, radial=radial),
+        "Fisheye624": lambda: dict(focal=focal, radial=radial),
+        "Mei": lambda: dict(xi=uniform(0, 3), focal=focal, radial=radial[:, :2]),
+        "BrownConrady": lambda: dict(
+            focal=focal, radial=radial[:, :3], denominator=uniform(-0.1, 0.1, 3)),
+        "Tabulated": lambda: dict(angles=rising(), radii=focal[:, None] * rising()),
+    }.get(name, lambda: dict(focal=focal))  # fmt: skip
+    return MODELS[name](**parameters())
 
 
 ASIDE = {

@@ -5,9 +5,10 @@ import math
 
 import pytest
 import torch
-from helpers import refused
+from helpers import refused, slow_but
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mishaps import parallel
 from rigs import board, f64, rig, true_lens
 
 from darswin.calibrate import CalibrationError, calibrate
@@ -16,25 +17,16 @@ TRUE = rig(true_lens("KannalaBrandt", 170), 6, least=20)
 CORNERS, BOARD, SIZE = TRUE.corners, TRUE.board, TRUE.size
 
 
-def parallel(fov, one_distance, noise):
-    """Boards that are parallel to the sensor."""
-    generator = torch.Generator().manual_seed(0)
-    lens = true_lens("KannalaBrandt", fov)
-    u = torch.rand(10, 1, 3, generator=generator, dtype=f64)
-    depth = torch.full_like(u[..., 2:], 0.2) if one_distance else 0.2 + 0.3 * u[..., 2:]
-    shift = torch.cat((0.3 * u[..., :2] - 0.15, depth), 2)
-    pixels = lens.project_points(torch.nn.functional.pad(BOARD - BOARD.mean(0), (0, 1)) + shift)
-    pixels[((pixels <= 1) | (pixels >= 950)).any(-1)] = math.nan
-    return pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=f64)
-
-
-@pytest.mark.parametrize(("fov", "one_distance", "noise", "model"), [
-    *itertools.product((60, 190), (True, False), (0.0, 0.2), ["KannalaBrandt"]),
-    pytest.param(100, False, 0.2, "auto", marks=pytest.mark.slow),
-])  # fmt: skip
-def test_boards_that_are_parallel_to_the_sensor(fov, one_distance, noise, model):
-    with pytest.raises(CalibrationError, match="nearly parallel to the sensor: tilt them by 20 to"):
-        calibrate(parallel(fov, one_distance, noise), BOARD, SIZE, model)
+@pytest.mark.parametrize(("fov", "one_distance"), slow_but(
+    itertools.product((60, 190), (True, False)), (60, True)
+))  # fmt: skip
+def test_boards_that_are_parallel_to_the_sensor(fov, one_distance):
+    """Without noise; with some, they are a mishap."""
+    true = rig(true_lens("KannalaBrandt", fov), 1)
+    change = parallel(0.0, 0.2, 0.2 if one_distance else 0.5, noise=0.0)
+    corners = change(true, torch.Generator().manual_seed(0)).corners
+    refused("nearly parallel to the sensor: tilt them by 20 to", calibrate, corners, BOARD, SIZE,
+            "KannalaBrandt", error=CalibrationError)  # fmt: skip
 
 
 ERRORS = {
@@ -66,6 +58,7 @@ ERRORS = {
 @pytest.mark.parametrize("case", ERRORS)
 def test_errors(case):
     corners, points, options, words = ERRORS[case]
+    options = {"model": "KannalaBrandt"} | options
     assert "\n" not in refused(words, calibrate, corners, points, SIZE, **options)
 
 
@@ -85,19 +78,18 @@ def test_wrong_sizes():
 
 def test_boards_at_one_distance_blurred_corners_and_few_pictures_are_doubted():
     found = calibrate(CORNERS[:1].expand(4, -1, -1), BOARD, SIZE, "Equidistant")
-    assert [text for text in found.doubts if "one distance" in text]
-    assert [
-        text
-        for text in found.doubts
-        if text.startswith("4 pictures show the board at 1 places, which are few")
-    ]
-    blurred = calibrate(rig(TRUE.lens, 10, noise=2.0).corners, BOARD, SIZE, "KannalaBrandt")
-    assert [text for text in blurred.doubts if "px off: the pictures are blurred" in text]
+    blurred = calibrate(rig(TRUE.lens, 3, noise=2.0).corners, BOARD, SIZE, "KannalaBrandt")
+    for words, doubts in (
+        ("all boards are at one distance", found.doubts),
+        ("4 pictures show the board at 1 places, which are few", found.doubts),
+        ("px off: the pictures are blurred", blurred.doubts),
+    ):
+        assert [text for text in doubts if words in text]
 
 
 def test_corners_in_the_middle_only_are_doubted():
-    narrow = rig(true_lens("KannalaBrandt", 190, shift=0.0).with_theta_max(0.6), 12)
-    found = calibrate(narrow.corners, BOARD, SIZE, "KannalaBrandt")
+    narrow = rig(true_lens("Equidistant", 190, shift=0.0).with_theta_max(0.6), 3)
+    found = calibrate(narrow.corners, BOARD, SIZE, "Equidistant")
     assert math.degrees(found.supported) == pytest.approx(math.degrees(0.6), abs=2)
     assert [text for text in found.doubts if text.startswith("corners reach 3")]
 

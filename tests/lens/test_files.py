@@ -330,3 +330,15 @@ def test_several_cameras():
     # A camera with a missing entry is an error only if it is read.
     text = file_text("kalibr_tumvi.yaml").replace("camera_model", "model", 1)
     assert loads(text, camera="cam1").focal.item() == focal
+
+
+@pytest.mark.parametrize("end", ["", "---\n", "---\n---\n"])
+def test_equal_messages_are_one_camera(end, tmp_path):
+    path, one = tmp_path / "messages.yaml", ROS2.removesuffix("---\n")
+    assert "sec: 1695049213" in one
+    messages = [one.replace("sec: 1695049213", f"sec: {k}") for k in range(3)]
+    path.write_text("---\n".join(messages) + end)
+    assert load(path).same_as(load(FILES / "ros2_echo.yaml"))
+    messages[2] = messages[2].replace("width: 640", "width: 320")
+    path.write_text("---\n".join(messages) + end)
+    refused("documents 1 and 3, .* differ in width: keep one", load, path)

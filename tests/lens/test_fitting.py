@@ -22,17 +22,13 @@ from darswin.lens import (
 FRONT = lens_examples.FRONT.to(f64).replace(affine=double(1, 0, 0, 1.1).view(1, 2, 2))
 
 
-@pytest.mark.parametrize(
-    "lens",
-    [
-        FRONT,
-        Spherical(torch.tensor(0.7, dtype=f64), 200.0, 1.6),
-        EnhancedUnified(torch.tensor(0.6145, dtype=f64), 1.0862, 198.354, 1.7),
-        DoubleSphere(torch.tensor(-0.2135, dtype=f64), 0.578, 331.24, 1.65),
-        KannalaBrandt(torch.tensor(190.98, dtype=f64), [0.0035, 0.0007, -0.0021, 0.0002], 1.8),
-    ],
-    ids=lambda lens: type(lens).__name__,
-)
+@pytest.mark.parametrize("lens", [
+    FRONT,
+    Spherical(double(0.7), 200.0, 1.6),
+    EnhancedUnified(double(0.6145), 1.0862, 198.354, 1.7),
+    DoubleSphere(double(-0.2135), 0.578, 331.24, 1.65),
+    KannalaBrandt(double(190.98), [0.0035, 0.0007, -0.0021, 0.0002], 1.8),
+], ids=lambda lens: type(lens).__name__)  # fmt: skip
 def test_every_model_finds_itself(lens):
     found, error = fit(type(lens), lens)
     assert error.item() < 1e-8
@@ -59,8 +55,7 @@ def test_the_error_is_what_is_left(model, most):
 
 @pytest.mark.slow
 def test_tangential_terms_are_fitted_where_the_model_has_them():
-    lens = Mei(torch.tensor(2.35, dtype=f64), 1390.0, [0.032, 2.4], 1.7,
-               tangential=[1.3e-3, -7e-4])  # fmt: skip
+    lens = Mei(double(2.35), 1390.0, [0.032, 2.4], 1.7, tangential=[1.3e-3, -7e-4])
     same, error = fit("Mei", lens)
     assert error.item() < 1e-3
     torch.testing.assert_close(same.tangential, lens.tangential, rtol=1e-3, atol=1e-7)
@@ -110,9 +105,7 @@ def test_a_field_of_rays_gives_opencvs_camera(kind):
     scale = np.random.default_rng(0).uniform(0.1, 9, (48, 60, 1))  # rays have any length
     rays = kind(scale * rays_of_opencv(grid((48, 60))))
     found, error = fit("KannalaBrandt", rays, size=(480, 640))
-    assert found.focal.dtype == (
-        torch.float64 if rays.dtype in (np.float64, f64) else torch.float32
-    )
+    assert found.focal.dtype == (f64 if rays.dtype in (np.float64, f64) else torch.float32)
     assert error.shape == (1,) and error < 1e-3 and found.image_size.tolist() == [[480, 640]]
     torch.testing.assert_close(found.center[0].double(), double(326.4, 231.7), atol=2e-3, rtol=0)
     assert found.focal.item() == pytest.approx(201.0, rel=1e-4)

@@ -152,19 +152,6 @@ def test_gradients_of_points():
     assert points.grad.any(1).tolist() == [True, True, True, False]
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_where_nothing_lands_there_is_no_gradient_either(name):
-    lens = example(name, torch.Generator().manual_seed(9), (0.8, 3))
-    lens = lens.with_theta_max(0.9 * lens.theta_limit)
-    tensors = {n: t.clone().requires_grad_() for n, t in lens._tensors().items()}
-    theta_max, values = tensors.pop("theta_max"), tensors.values()
-    made = lens.replace(**tensors)
-    radius = torch.cat((lens.r_max[:, None] * double(0.3, 0.8), double(1e9).expand(4, 1)), 1)
-    theta = made.unproject(radius)
-    torch.where(theta <= theta_max[:, None], theta, 0.0).sum().backward()
-    assert all(value.grad.isfinite().all() and value.grad.any() for value in values)
-
-
 # What is made of wrong arguments, and the words of its error.
 OUT_OF_RANGE = (
     (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
@@ -229,10 +216,10 @@ def test_a_wrong_argument_is_named(error, make, said):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_rays_beyond_the_limit_land_nowhere(name):
+def test_rays_and_pixels_beyond_the_limit_are_nowhere_and_have_no_gradient(name):
     """As `project_points`; 45 is an angle in degrees by mistake."""
-    lens = example(name, torch.Generator().manual_seed(6))
-    lens = lens.with_theta_max(lens.theta_max * 0.7)
+    lens = example(name, torch.Generator().manual_seed(6), (0.8, 3))
+    lens = lens.with_theta_max(0.7 * lens.theta_limit)
     theta = lens.theta_max[:, None] * double(0.2, 1.0, 1.001, 1.3)
     theta = torch.cat((theta, torch.full_like(theta[:, :2], 45.0)), 1).requires_grad_()
     azimuth = double(0.3).requires_grad_()
@@ -241,6 +228,11 @@ def test_rays_beyond_the_limit_land_nowhere(name):
     assert torch.equal(pixels[:, :2], lens.pixels(theta[:, :2], direction_of(azimuth), (480, 640)))
     pixels[:, :2].sum().backward()
     assert theta.grad.isfinite().all() and azimuth.grad.isfinite().all()
+    back, values = in_parameters(lens, "unproject")
+    radius = torch.cat((lens.r_max[:, None] * double(0.3, 0.8), double(1e9).expand(4, 1)), 1)
+    found = back(radius, *values)
+    torch.where(found <= lens.theta_max[:, None], found, 0.0).sum().backward()
+    assert all(value.grad.isfinite().all() and value.grad.any() for value in values)
 
 
 def test_a_class_is_a_model_unless_it_says_otherwise():
@@ -344,13 +336,14 @@ def test_an_image_is_solved_as_its_rows_are(name, precision, monkeypatch):
             rows = torch.cat([function(few) for few in values.split(6, 1)], 1)
             assert image.isfinite().double().mean() > 0.8
             close(image, rows, bound)
-            for tensor in lens._tensors().values():
-                slopes = (
-                    torch.autograd.grad(x.nan_to_num().square().mean(), tensor, allow_unused=True,
-                                        retain_graph=True, materialize_grads=True)[0]
-                    for x in (image, rows)
-                )  # fmt: skip
-                close(*slopes, 100 * bound)
+            options = dict(allow_unused=True, retain_graph=True, materialize_grads=True)
+            tensors = [*lens._tensors().values()]
+            slopes = (
+                torch.autograd.grad(x.nan_to_num().square().mean(), tensors, **options)
+                for x in (image, rows)
+            )
+            for pair in zip(*slopes, strict=True):
+                close(*pair, 100 * bound)
 
 
 def test_where_no_gradients_are_recorded_a_lens_does_not_switch_them_off():

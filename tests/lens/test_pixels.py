@@ -16,12 +16,7 @@ from darswin.lens import (
     distance_to_z,
     z_to_distance,
 )
-from darswin.lens.pixels import (
-    pixel_angles,
-    pixel_rays,
-    ray_channels,
-    solid_angles,
-)
+from darswin.lens.pixels import pixel_angles, pixel_rays, ray_channels, solid_angles
 
 f64 = torch.float64
 
@@ -134,7 +129,7 @@ def test_what_is_not_known_stays_so():
 
 def test_wrong_maps_are_named():
     lens = Equidistant([3.0, 4.0], 1.4)
-    with pytest.raises(ValueError, match=r"\(N, H, W\) or \(N, 1, H, W\), got \(2, 3, 4, 4\)"):
-        distance_to_z(torch.ones(2, 3, 4, 4), lens)
+    said = r"\(N, H, W\) or \(N, 1, H, W\), got \(2, 3, 4, 4\)"
+    refused(said, distance_to_z, torch.ones(2, 3, 4, 4), lens)
     refused("2 lenses for 3 maps", z_to_distance, torch.ones(3, 4, 4), lens)
     refused("tensor, got float", distance_to_z, 1.0, lens, error=TypeError)

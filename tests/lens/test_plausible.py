@@ -6,7 +6,6 @@ import math
 import re
 import warnings
 
-import numpy as np
 import pytest
 import torch
 from lens_examples import FILES, FISHEYE, FRONT, PLUMB_BOB, K, f64, flat, loads, message, opencv
@@ -86,18 +85,14 @@ def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     assert "\n" not in doubt and len(doubt) < 250
 
 
-@pytest.mark.parametrize(
-    ("lens", "pattern"),
-    [
-        (Stereographic(2.8, image_size=(H, W)), "a θ_max of 180°; the focal .* in mm$"),
-        (Orthographic(2.8, image_size=(H, W)), "circle of 5.6 px up to θ_max = 90°; .* in mm$"),
-        (Spherical(0.9, 5.0, image_size=(H, W)), "; the focal length would fit in mm$"),
-        (Equidistant(F, 0.029, image_size=(H, W)), r"θ_max = 1.66\d°; θ_max may be in another"),
-        (Equidistant(3e4, 1.7, image_size=(H, W)), "an image circle of 102000 px up to θ_max"),
-        (Perspective(F, 1.57, image_size=(H, W)), "a θ_max of 89.95°"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
+@pytest.mark.parametrize(("lens", "pattern"), [
+    (Stereographic(2.8, image_size=(H, W)), "a θ_max of 180°; the focal .* in mm$"),
+    (Orthographic(2.8, image_size=(H, W)), "circle of 5.6 px up to θ_max = 90°; .* in mm$"),
+    (Spherical(0.9, 5.0, image_size=(H, W)), "; the focal length would fit in mm$"),
+    (Equidistant(F, 0.029, image_size=(H, W)), r"θ_max = 1.66\d°; θ_max may be in another"),
+    (Equidistant(3e4, 1.7, image_size=(H, W)), "an image circle of 102000 px up to θ_max"),
+    (Perspective(F, 1.57, image_size=(H, W)), "a θ_max of 89.95°"),
+])  # fmt: skip
 def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
     assert re.search(pattern, doubts(lens)[0]), doubts(lens)[0]
 
@@ -247,17 +242,8 @@ def test_the_command_line_says_what_looks_wrong(tmp_path, capsys):
     main(["lens", "convert", str(path), str(tmp_path / "out.json")])
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("darswin: OpenCV calibration") and "would fit in mm" in line
-    main(["lens", "info", str(FILES / "woodscape.json")])
-    assert "looks wrong" not in capsys.readouterr().out
     path = tmp_path / "cameras.txt"
     path.write_text("1 FOV 640 480 300 300 320 240 0.9\n2 FOV 640 480 1.1 1.1 320 240 0.9\n")
     main(["lens", "info", str(path)])
-    printed = capsys.readouterr().out
-    assert re.search("^  2  .*; looks wrong: .* in mm", printed, re.M)
-    assert not re.search("^  1  .*looks", printed, re.M)
-
-
-def test_arrays_in_mm(tmp_path):
-    path = tmp_path / "calib.npz"
-    np.savez(path, K=np.diag([1.3, 1.3, 1.0]), D=np.array(FISHEYE), shape=(960, 1280))
-    assert "far from the middle" in warned(lambda: load(path, coefficients="fisheye"))[0]
+    (line,) = re.findall("^ .*looks wrong.*$", capsys.readouterr().out, re.M)
+    assert re.match("  2  .*; looks wrong: .* in mm", line)

@@ -129,14 +129,10 @@ def test_samples_of_any_grid_stand_in_their_patches(lens, rings, sectors, data):
     spacings = st.sampled_from([s for s in SPACINGS if narrow or s != "tan"])
     spacing, inner = data.draw(spacings), data.draw(spacings)
     hypothesis.assume(type(lens).__name__ != "OCamInverse" or "radius" not in (spacing, inner))
-    grid = PolarView(
-        rings=rings,
-        sectors=sectors,
-        samples=samples,
-        spacing=spacing,
-        sample_spacing=inner,
-        placement=placement,
-    ).grid(lens, (480, 640))
+    view = PolarView(
+        rings, sectors, samples, spacing=spacing, sample_spacing=inner, placement=placement
+    )
+    grid = view.grid(lens, (480, 640))
     slack = 1e-6 * (1 + lens.r_max[:, None, None])
     assert grid.radii.shape == (len(lens), rings * samples[0])
     assert grid.borders.shape == (len(lens), rings + 1)

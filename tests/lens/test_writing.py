@@ -1,6 +1,7 @@
 """Files written in the formats of OpenCV, COLMAP, Kalibr and our own hold the same lens."""
 
 import json
+import re
 from itertools import product
 
 import cv2
@@ -9,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import refused
+from helpers import refused, slow_but
 from hypothesis import strategies as st
 from lens_examples import ASIDE, FILES, assert_projects, double, example, f64, points_around
 from torch.testing import assert_close
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Spherical, from_dict, load, load_all, save, to_dict
+from darswin.lens import MODELS, Fisheye624, Spherical, from_dict, load, load_all, save, to_dict
 from darswin.lens.curves import as_curves
 from darswin.lens.files.load import Calibration
 
@@ -217,6 +218,53 @@ def test_refusals(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+TILTED = Fisheye624(
+    300.0, radial=[0.02, -0.01], tangential=[0.0012, -0.0008], prism=[0.001, 0.0, -0.0006, 0.0],
+    center=[320.2, 239.1], image_size=(480, 640), theta_max=1.2,
+    affine=[[1.0, 0.002], [0.001, 1.003]],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("out", "model", "lost"), slow_but([
+    ("camera.yaml", "KannalaBrandt", "tangential terms and prism terms and skew"),
+    ("camera.yaml", "Mei", "prism terms and skew"),
+    ("kalibr.yaml", "KannalaBrandt", "tangential terms and prism terms and skew"),
+    ("camera.json", "Equidistant", "tangential terms and prism terms"),
+    ("camera.json", "KannalaBrandt", None)],
+    ("camera.yaml", "KannalaBrandt", "tangential terms and prism terms and skew"),
+    ("camera.json", "Equidistant", "tangential terms and prism terms"),
+    ("camera.json", "KannalaBrandt", None),
+))  # fmt: skip
+def test_convert_leaves_out_what_the_format_cannot_hold(out, model, lost, tmp_path, capsys):
+    given, path = tmp_path / "given.json", tmp_path / out
+    save(TILTED, given)
+    main(["lens", "convert", str(given), str(path), "--model", model])
+    printed = capsys.readouterr().out
+    assert ("it leaves out" in printed) == (lost is not None)
+    assert lost is None or f", whose {lost} it leaves out" in printed
+    said = float(re.search(r"at most (\S+) px", printed)[1])
+    theta = torch.linspace(0.05, 1.2, 40)[:, None].expand(40, 60)[None]
+    azimuth = torch.linspace(0, 2 * torch.pi, 60)[None, None].expand(1, 40, 60)
+    found = load(path).with_theta_max(None)
+    assert type(found).__name__ == model
+    apart = found.project_rays(theta, azimuth) - TILTED.project_rays(theta, azimuth)
+    assert apart.norm(dim=-1).max().item() == pytest.approx(said, rel=0.06)
+
+
+def test_a_calibration_replaces_calibrations_alone(tmp_path, capsys):
+    given, other, new = (tmp_path / name for name in ("a.json", "b.json", "c.json"))
+    save(TILTED, given)
+    other.write_bytes(b"\x89PNG and more")
+    with pytest.raises(SystemExit) as end:
+        main(["lens", "convert", str(given), str(other)])
+    assert end.value.code == 2
+    assert "b.json would replace a file that is no" in capsys.readouterr().err
+    assert other.read_bytes() == b"\x89PNG and more"
+    for _ in range(2):
+        main(["lens", "convert", str(given), str(new)])
+    assert load(new).same_as(load(given))
+
+
 def test_commands(tmp_path, capsys):
     calib, out = str(FILES / "kalibr_tumvi.yaml"), tmp_path / "cameras.txt"
     main(["lens", "convert", calib, str(out), "--camera", "cam1"])
@@ -227,10 +275,6 @@ def test_commands(tmp_path, capsys):
           "--theta_max_deg=60"])  # fmt: skip
     printed = capsys.readouterr().out
     assert "kalibr, KannalaBrandt up to 60.00°; kalibr files have no θ_max" in printed
-    woodscape, out = str(FILES / "woodscape.json"), tmp_path / "w.xml"
-    main(["lens", "convert", woodscape, str(out), "--model", "KannalaBrandt"])
-    assert "opencv, KannalaBrandt up to 95.21°, at most" in capsys.readouterr().out
-    assert type(load(out)).__name__ == "KannalaBrandt"
-    main(["lens", "info", woodscape])
+    main(["lens", "info", str(FILES / "woodscape.json")])
     origin = "WoodScape, with the centre of the upper left pixel at (0.5, 0.5)\n"
     assert f"format          {origin}" in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """What goes wrong in a calibration, as corners: each mishap takes a good rig and a generator, and
-gives the corners and the board that a user would calibrate from. `python tests/mishaps.py` prints
-what is said of all of them."""
+gives the corners and the board that a user would calibrate from. `python
+tests/calibrate/mishaps.py` prints what is said of all of them."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -82,18 +82,20 @@ def again(poses: list[int], times: int, jitter: float = 1e-4):
     def change(true: Rig, g) -> Given:
         which = torch.tensor(poses).repeat_interleave(times)
         small = turn(jitter * torch.randn(len(which), 3, generator=g, dtype=f64))
-        moved = true.translations[which] + 0.1 * jitter * torch.randn(
-            len(which), 3, generator=g, dtype=f64
-        )
-        return Given(
-            seen(true.lens, flat(true.board), true.rotations[which] @ small, moved, 0.1, g),
-            true.board,
-        )
+        moved = 0.1 * jitter * torch.randn(len(which), 3, generator=g, dtype=f64)
+        turns, places = true.rotations[which] @ small, true.translations[which] + moved
+        return Given(seen(true.lens, flat(true.board), turns, places, 0.1, g), true.board)
 
     return change
 
 
-def parallel(tilt: float, nearest: float = 0.2, farthest: float = 0.5, spread: float = 0.3):
+def parallel(
+    tilt: float,
+    nearest: float = 0.2,
+    farthest: float = 0.5,
+    spread: float = 0.3,
+    noise: float = 0.1,
+):
     """Boards that are parallel to the sensor, up to a tilt in degrees."""
 
     def change(true: Rig, g) -> Given:
@@ -102,9 +104,8 @@ def parallel(tilt: float, nearest: float = 0.2, farthest: float = 0.5, spread: f
         turns = turn(torch.cat((lean * (u[:, 5:] + 0.5), 3 * u[:, 5:]), 1))
         depth = nearest + (farthest - nearest) * (u[:, 2:3] + 0.5)
         place = torch.cat((spread * u[:, :2], depth), 1)
-        return Given(
-            seen(true.lens, flat(true.board - true.board.mean(0)), turns, place, 0.1, g), true.board
-        )
+        middle = flat(true.board - true.board.mean(0))
+        return Given(seen(true.lens, middle, turns, place, noise, g), true.board)
 
     return change
 
@@ -250,6 +251,12 @@ MISHAPS: dict[str, Callable[[Rig, torch.Generator], Given]] = {
 }  # fmt: skip
 
 
+def shown(corners: Tensor) -> Tensor:
+    """The corners in the picture; NaN for the others."""
+    there = ((corners >= 0) & (corners <= LAST)).all(-1, keepdim=True)
+    return torch.where(there, corners, math.nan)
+
+
 def case(name: str, fov: float, seed: int) -> tuple[Rig, Given]:
     """A rig of 15 pictures, and what a mishap makes of it."""
     true = rig(true_lens("KannalaBrandt", fov, seed=seed), 15, noise=0.1, seed=seed)
@@ -261,8 +268,7 @@ def case(name: str, fov: float, seed: int) -> tuple[Rig, Given]:
                 center=true.lens.center + torch.tensor([0, 0.01]) * (true.lens.center - 480),
             )
         )
-    there = ((given.corners >= 0) & (given.corners <= LAST)).all(-1, keepdim=True)
-    return true, given._replace(corners=torch.where(there, given.corners, math.nan))
+    return true, given._replace(corners=shown(given.corners))
 
 
 def outcome(name: str, fov: float, seed: int) -> tuple[float, str, str]:
