@@ -181,7 +181,7 @@ def test_a_run_brings_its_own_lens(run, capsys, tmp_path):
     (run / "sub" / "p.png").write_bytes((run / "p.png").read_bytes())
     entries = {"sub": "one.json", ".": LENS}
     (run / "lenses.json").write_text(json.dumps(entries))
-    argv = ["predict", "p.png", str(run / "sub" / "p.png"), "--run", "."]
+    argv = ["predict", "p.png", "sub/p.png", "--run", "."]
     argv += ["--top", "6"]
 
     def printed(*more):
@@ -267,5 +267,5 @@ def test_the_frames_of_a_video_have_their_times_and_its_speed(run, capsys):
     assert speed["video"] == "v.mp4" and speed["frames"] == 5
     overall, network = speed["frames_per_second"], speed["network_frames_per_second"]
     assert 0 < overall < network
-    line = f"darswin: {run}/v.mp4: 5 frames at {overall} frames/s; the network alone:"
+    line = f"darswin: v.mp4: 5 frames at {overall} frames/s; the network alone:"
     assert f"{line} {network} frames/s" in said.err

@@ -113,7 +113,7 @@ REFUSED = {
         --to wide.json --lens wide.json --size 0,5 => --size must be at least 1,1
         --to wide.json --lens wide.json --up 0,1,0 => --up must be left out unless --to is a view
         --to nowhere.json --lens wide.json => --to nowhere.json is neither a file nor a view:
-        --to lens.json --lens wide.json => lens.json has no image_size: give --size
+        --to bare.json --lens wide.json => bare.json has no image_size: give --size
         --to {"model":"Perspective","fov_deg":70} --lens wide.json => needs the image_size
         --to tiles:x --lens wide.json => --to must be NAME or NAME:COUNT, such as tiles:5
         --to tiles: --lens wide.json => --to must be NAME or NAME:COUNT, .* got tiles:
@@ -127,12 +127,12 @@ REFUSED = {
         --to mercator --lens wide.json --up 0,1 => --up must be three finite numbers
     """,
     "warp --to mercator --lens wide.json": r"""
-        set --out set/new => --out must be a folder outside of set, got set/new
+        lone --out lone/new => --out must be a folder outside of lone, got lone/new
         set/instances.json --out more => --out more holds other files
         set/instances.json --out p.png => --out must be a folder, but p.png is a file
         lists.json --out new => lists.json.* must have the lists "images"
         form.json --out new => is not in COCO's form: expected str
-        outside.json --out new => outside of the folder set/images, .*p.png: name them relative
+        set/outside.json --out new => outside of the folder set/images, .*p.png: name them relative
         two --out new => 2 files of labels: give one of them.*other.json
     """,
     "lens": r"""
@@ -163,7 +163,7 @@ REFUSED = {
         --view=panorama --fov_deg=90 => --fov_deg must be 360° for a panorama view, got 90
         --view=square --pitch_deg=9 => --pitch_deg must be 0 for a square view, which
         --up=0,0,0 => --up must be three finite .*, got \(0.0, 0.0, 0.0\)
-        --up=0,.inf,0 => --up must be three finite
+        --up=0,.inf,0 => --up must be 3 numbers, such as 0.5,0.5,0.5, got 0,.inf,0
         --up=0,1e999,2 => --up must be three finite numbers
         --up=0,1 => --up must be 3 numbers, such as 0.5,0.5,0.5, got
         --yaw_deg=inf => --yaw_deg must be from -360° to 360°, got inf
@@ -204,7 +204,8 @@ REFUSED = {
     """,
     "lens calibrate --board=6x5 --square=0.03 --model=Mei": r"""
         => missing pictures
-        empty => missing pictures
+        empty => no pictures or videos in empty
+        films => missing pictures
         none => no file or folder none
         boards --kind=round => --kind must be one of chessboard, charuco, april
         boards --kind=charuco => --kind charuco needs --marker
@@ -227,7 +228,8 @@ REFUSED = {
     """,
     "lens estimate": r"""
         => missing pictures
-        empty => no pictures in empty
+        empty => no pictures or videos in empty
+        films => no pictures in films
         nothing.png => there is no file or folder nothing.png
         boards --fov_deg 400 => --fov_deg must be above 0° and below 360°, got 400
         even.png --fov_deg 180 => no image circle is visible
@@ -271,7 +273,7 @@ REFUSED = {
         r --trainer.max_epochs -1 => cosine needs an end: set --trainer.max_epochs or
         r --checkpoint_steps 0 => --checkpoint_steps must be at least 1, got 0
         r --devices many => error: --devices:
-        r --data.pth x => error: unrecognized arguments: --data.pth x; the nearest option is --data.p
+        r --data.pth x => ^error: unrecognized arguments: --data.pth x; the nearest option is --data
         r --data.lmit 3 --batch_size 2 => the nearest option is --data.limit, --data.batch_size;
         r --epochs 3 => the nearest option is --trainer.max_epochs; `darswin fit --help`
         r --data.xi 0.3 => the nearest option is --xi;
@@ -289,7 +291,7 @@ REFUSED = {
     "test --run": r"""
         best.safetensors => --run names .* best.safetensors is a file\. --model.weights takes a mo
         r => there is no run in r
-        began => no model in began yet
+        trained => no model in trained yet
         began --task segmentation => began is a run of --task classification, not of segmentation
     """,
 }
@@ -318,6 +320,7 @@ FILES_OF_TEXT = {
     "out/undistorted.json": [],
     "boards/0.png": "no picture",
     "set/instances.json": SET,
+    "lone/instances.json": SET,
     "two/annotations/instances.json": SET,
     "two/annotations/other.json": SET,
     "lists.json": {"images": []},
@@ -327,6 +330,8 @@ FILES_OF_TEXT = {
     "speed.yaml": "model: {speed: 3}",
     "began/config.yaml": "data: {path: digits}\n",
     "began/checkpoints/best.ckpt": "",
+    "trained/config.yaml": "data: {path: digits}\n",
+    "films/film.mp4": "no video",
     "done/checkpoints/last.ckpt": "",
     "best.safetensors": "",
     "empty/readme.txt": "",
@@ -342,8 +347,9 @@ def world(tmp_path_factory):
         text = content if isinstance(content, str) else json.dumps(content)
         (folder / name).write_text(text)
     noise = np.random.default_rng(0).integers(256, size=(64, 96, 3), dtype=np.uint8)
-    pictures = {name: noise for name in ("p.png", "in/p.png", "out/p.png", "more/own/b.png")}
-    pictures |= {"set/images/0.png": noise, "even.png": np.full((90, 120, 3), 80, np.uint8)}
+    pictures = dict.fromkeys(("p.png", "in/p.png", "out/p.png", "more/own/b.png"), noise)
+    pictures |= {"set/images/0.png": noise, "lone/images/0.png": noise}
+    pictures |= {"even.png": np.full((90, 120, 3), 80, np.uint8)}
     pictures |= {"front.png": np.zeros((483, 640, 3)), "square.png": np.zeros((40, 40, 3))}
     for name, picture in pictures.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
