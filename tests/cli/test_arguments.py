@@ -110,23 +110,6 @@ def test_wrong_arguments_are_one_sentence(capsys, typed, said):
     assert line.startswith(f"prog: {said}") and line.endswith("; see `prog --help`")
 
 
-@pytest.mark.parametrize(
-    "argv, said",
-    [
-        (["models", "swin"], "unrecognized arguments: swin"),
-        (["convert"], "the following arguments are required: source, target"),
-        (["convert", "none.pth", "out.safetensors"], "No such file or directory: 'none.pth'"),
-        (["convert", "a", "b", "--fast"], "unrecognized arguments: --fast"),
-        (["train"], "no command 'train'. The commands are fit, "),
-        (["lents"], "no command 'lents'; did you mean lens? The commands are fit, "),
-    ],
-)
-def test_misuse_ends_with_a_sentence_before_any_work(capsys, argv, said):
-    with pytest.raises(SystemExit) as end:
-        main(argv)
-    assert end.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
-
-
 WORDS = st.sampled_from(
     ["models", "convert", "--size", "--out", "--config", "--foo", "-x", "-", "--", "", "0",
      "-1", "9" * 5000, "1e300", "nan", "[", "[]", "1,,2", ",", "x", ".", "/dev/null", "\ud800",

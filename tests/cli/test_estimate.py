@@ -84,26 +84,3 @@ def test_pictures_turned_by_exif_give_the_lens_of_stored_pictures(rooms, tmp_pat
     found = lenses.load(out)
     assert found.image_size.tolist() == [list(SIZE)]
     assert found.unproject(200.0).item() == pytest.approx(rim, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "missing pictures"),
-        (["nothing.png"], "there is no file or folder nothing.png"),
-        (["ROOMS", "--fov_deg", "400"], "--fov_deg must be above 0° and below 360°, got 400"),
-        (["ROOMS", "--fov_deg", "180"], "no image circle is visible"),
-        (["ROOMS", "--model", "Sphericl"], "unknown lens model 'Sphericl'"),
-        (["ROOMS/0.png", "--out", "ROOMS/0.png"], "0.png"),
-        (["EVEN"], "only 0 curves may be straight lines, but an estimate needs 10"),
-    ],
-)
-def test_what_cannot_be_done_is_said_in_one_sentence(rooms, tmp_path, arguments, message, capsys):
-    cv2.imwrite(str(tmp_path / "even.png"), np.full((90, 120, 3), 80, np.uint8))
-    places = {"ROOMS": str(rooms[0]), "EVEN": str(tmp_path / "even.png")}
-    for name, place in places.items():
-        arguments = [argument.replace(name, place) for argument in arguments]
-    with pytest.raises(SystemExit) as error:
-        main(["lens", "estimate", *arguments])
-    said = f"{error.value} {capsys.readouterr().err}"
-    assert message in said and "Traceback" not in said

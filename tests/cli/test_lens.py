@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import FILES, FRONT
 
-from darswin.cli import lens as cli
 from darswin.cli.main import main
-from darswin.lens import Perspective, Polynomial, from_dict, to_dict
+from darswin.lens import Perspective, from_dict, to_dict
 from darswin.views.registry import flat_views
 from darswin.viz import plot
 
@@ -90,50 +89,6 @@ def test_how_far_corners_support_a_lens_is_kept_and_shown(folder, capsys, monkey
     assert drawn == [1.25, None]
 
 
-def refusal(capsys, *arguments):
-    """The one line with which a command refuses its arguments, with exit code 2."""
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    assert end.value.code == 2 and not printed.out
-    (line,) = printed.err.splitlines()
-    return line
-
-
-@pytest.mark.parametrize(
-    "options, said",
-    [
-        (
-            ["--fov_deg", "0"],
-            "--fov_deg must be above 0° and at most 179.9° for a perspective view",
-        ),
-        (["--fov_deg=180"], "--fov_deg must be above 0° and at most 179.9° .*, got 180"),
-        (["--view=stereographic", "--fov_deg=341"], "at most 340° for a stereographic view"),
-        (["--view=panorama", "--fov_deg=90"], "--fov_deg must be 360° for a panorama view, got 90"),
-        (["--view=square", "--pitch_deg=9"], "--pitch_deg must be 0 for a square view, which"),
-        (["--up=0,0,0"], r"--up must be three finite .*, got \(0.0, 0.0, 0.0\)"),
-        (["--up=0,.inf,0"], "--up must be"),
-        (["--up=0,1"], "--up must be 3 numbers, such as 0.5,0.5,0.5, got"),
-        (["--up=0,1" + "0" * 400 + ",2"], "--up must be three finite numbers"),
-        (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
-        (["--yaw_deg=inf"], "--yaw_deg must be from -360° to 360°, got inf"),
-        (["--theta_max_deg=0"], "--theta_max_deg must be above 0° and at most 180°, got 0"),
-        (["--rings=100000000"], "--rings must be from 1 to 1024, got 100000000"),
-        (["--sectors=0"], "--sectors must be from 1 to 4096, got 0"),
-        (["--samples=200,200"], "must be at most 4194304 samples, got 40960000"),
-        (["--out=lens.gif"], r"must end in one of \.png, \.jpg, .*, got 'lens.gif'"),
-    ],
-)
-def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options, said):
-    def work(*arguments, **options):
-        raise AssertionError("it was refused too late")
-
-    monkeypatch.setattr(cli, "PolarView", work)
-    picture = folder / "front.png"
-    line = refusal(capsys, "lens", "show", folder / "front.json", picture, *options)
-    assert line.startswith("darswin") and re.search(said, line)
-
-
 def test_a_box_beyond_the_picture_is_told(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     for box, told in (("0,160,966,966", False), ("100,200,900,900", True), ("-1,0,9,9", True)):
@@ -147,35 +102,6 @@ def test_radians_in_place_of_degrees_are_told(folder, capsys, monkeypatch):
         ["lens", "show", "front.json", "front.png", "--fov_deg", "1.5", "--rings=2", "--sectors=4"]
     )
     assert "--fov_deg 1.5 is a narrow view; 1.5 rad would be 85.94°" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("argv", "said"),
-    [
-        ("undistort . front.json --out new", ". is a folder, but must be a calibration file"),
-        ("undistort front.json fotos --out new", "there is no file or folder fotos$"),
-        ("show front.json square.png", r"for 1280×966 \(W×H\) but the picture is 400×400"),
-        ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
-        ("show front.json front.png --out front.png", "--out front.png would replace front.png"),
-        ("convert front.json front.json --model Mei", "--out front.json would replace front.json"),
-        (
-            "crop front.json ./front.json --box 0,0,9,9",
-            "--out ./front.json would replace",
-        ),
-        ("crop front.json new.json --box 0,0,9,9 --size 0,9", "--size must be from 1 to .*, got 0"),
-        ("crop front.json new.json --box 0,0,0,9 --size 9,9", "--box must be from 1 to .*, got 0"),
-        ("info wrong.json", "wrong.json"),
-        ("info bare.json", "lacks the size of its images: give --image_size, their height"),
-        ("draw front.json", "invalid choice: 'draw'"),
-        ("show", "arguments are required: calib, image"),
-    ],
-)
-def test_what_is_wrong_is_one_line(folder, capsys, monkeypatch, argv, said):
-    monkeypatch.chdir(folder)
-    cv2.imwrite("square.png", np.zeros((400, 400, 3), np.uint8))
-    (folder / "wrong.json").write_text('{"model": "Spherical"}')
-    (folder / "bare.json").write_text(json.dumps(to_dict(Polynomial([300.0], 1.5))))
-    assert re.search(said, refusal(capsys, "lens", *argv.split()))
 
 
 def test_cameras_of_a_file_are_listed(capsys):
@@ -320,26 +246,3 @@ def test_errors_show_names_of_files_as_they_are(tmp_path, capsys):
         main(["lens", "crop", str(folder / "two.yaml"), str(tmp_path / "o"), "--size", "9,9"])
     shown = capsys.readouterr().err
     assert "choose one with --camera: 'cam0'" in shown and "camera=front" in shown
-
-
-@pytest.mark.parametrize(
-    ("command", "said"),
-    [
-        (
-            "lens info front.json --coeficients x",
-            "the nearest option is --coefficients; see `darswin",
-        ),
-        (
-            "lens undistort front.json x --out o --yaw_degree 3",
-            "the nearest option is --yaw_deg; see",
-        ),
-        ("predict x.png --calib_lenses x --evry 2", "the nearest option is --every; see"),
-        ("predict x.png --lenz x --evry=2", "the nearest option is --lens, --every; see"),
-        ("quantize --run r --tolerence 2", "the nearest option is --tolerance; see"),
-        ("models --zzzzzz 2", "unrecognized arguments: --zzzzzz 2; see `darswin models --help`"),
-    ],
-)
-def test_misspelt_options_are_answered_with_the_nearest(capsys, command, said):
-    with pytest.raises(SystemExit):
-        main(command.split())
-    assert said in capsys.readouterr().err
