@@ -1,6 +1,5 @@
 """Answers to a stream of images: classes, and files of a network whose answer is known."""
 
-import itertools
 import json
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import slow_but
+from helpers import refused
 from PIL import Image
 from videos import write_video
 
@@ -17,8 +16,6 @@ from darswin.cli import answers as module
 from darswin.cli import predict as predict_module
 from darswin.cli.answers import (
     ClassAnswers,
-    DistanceAnswers,
-    LabelAnswers,
     distance_png,
     label_png,
 )
@@ -26,14 +23,10 @@ from darswin.cli.main import main
 from darswin.cli.pictures import claim_folder, file_names
 from darswin.cli.predict import ANSWERS as RECORD
 from darswin.data import FullSize, fitted
-from darswin.data.framing import CutOff
-from darswin.lens import Equidistant, KannalaBrandt, from_dict
-from darswin.lens.pixels import pixel_angles
+from darswin.lens import from_dict
 from darswin.models.encoder import Encoder
 from darswin.models.prepared import Prepared
-from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, save_model
-from darswin.train.finetuning import models_for
 from darswin.views.base import PreparedPixels
 from darswin.viz.pixels import UNKNOWN, palette
 
@@ -286,35 +279,18 @@ def test_names_of_files_differ_and_keep_their_folders(
     assert file_names(paths, [(name, name in videos) for name in expected]) == expected
 
 
-def test_nothing_but_its_own_is_replaced(tmp_path):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in/p.png").touch()
-    (tmp_path / "list").mkdir()
-    (tmp_path / "list/predictions.json").write_text('{"mine": 1}')
-    for out, said in ((None, "missing --out"), ("in", "holds other files"),
-                      ("in/p.png", "is a file"), ("list", "holds other files")):  # fmt: skip
-        with pytest.raises(ValueError, match=said):
-            claim_folder(out and str(tmp_path / out), RECORD)
-    assert [path.name for path in (tmp_path / "in").iterdir()] == ["p.png"]
-    (tmp_path / "empty").mkdir()
-    for out in ("empty", "new/out"):
-        assert claim_folder(str(tmp_path / out), RECORD) == tmp_path / out
-        assert json.loads((tmp_path / out / "predictions.json").read_text()) == []
-        (tmp_path / out / "labels").mkdir()  # of a run that was killed
-        claim_folder(str(tmp_path / out), RECORD)
+def test_a_record_of_another_program_is_not_replaced(tmp_path):
+    (tmp_path / "predictions.json").write_text('{"mine": 1}')
+    refused("holds other files", claim_folder, str(tmp_path), RECORD)
+    (tmp_path / "predictions.json").write_text("[]")
+    (tmp_path / "labels").mkdir()  # of a run that was killed
+    assert claim_folder(str(tmp_path), RECORD) == tmp_path
 
 
-def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
-    picture = write(tmp_path / "p.png", picture_of(labels))
-    net = stub("segmentation")
-    argv = ["predict", picture, "--model", "m.safetensors", "--lens", json.dumps(LENS)]
-    with pytest.raises(SystemExit, match="missing --out"):
-        main(argv)
-    with pytest.raises(SystemExit, match=r"--task is distance, but m\.safetensors is a model"):
-        main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
-    net.num_classes = 256
+def test_more_classes_than_a_png_holds_are_refused(stub, labels, tmp_path):
+    stub("segmentation").num_classes = 256
     with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
-        main([*argv, "--out", str(tmp_path / "o")])
+        predict(write(tmp_path / "p.png", picture_of(labels)), out=tmp_path / "o")
 
 
 def test_a_real_model_answers_as_in_python(tmp_path):
@@ -335,57 +311,6 @@ def test_a_real_model_answers_as_in_python(tmp_path):
         output = model(torch.from_numpy(remap(image))[None], remap.camera)[0].numpy()
     expected = FullSize(remap).labels(output)
     assert (ids(out / "labels/p.png") == expected).mean() > 0.998
-
-
-KINDS = [name for name in models_for("segmentation") if name.endswith("nano")]
-GENERAL = dict(tangential=[0.02, -0.01], affine=[[1.0, 0.05], [0.0, 0.9]])
-
-
-ANSWERS = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
-
-
-@pytest.mark.parametrize(
-    ("name", "task"),
-    slow_but([*itertools.product(KINDS, ANSWERS)], ("swin_unet_nano", "distance"),
-             ("darswin_unet_a_nano", "segmentation")),
-)  # fmt: skip
-def test_every_pixel_that_a_ray_reaches_has_an_answer(name, task, tmp_path, recwarn):
-    """Of square, wide and tall pictures, of lenses whose circle is cut, shifted or sheared."""
-    answers_of = ANSWERS[task]
-    options = dict(task=task, num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
-    if has_image_size(name):
-        options["image_size"] = 64
-    sizes = {"square": (60, 60), "wide": (60, 84), "tall": (84, 60)}
-    rng = np.random.default_rng(0)
-    for fit in ("stretch", "crop"):
-        card = ModelCard(name, options, NAMES if task == "segmentation" else (), 64, 0.0, fit, task)
-        answers = answers_of(card.create().eval(), card, tmp_path, {p: p for p in sizes})
-        recwarn.clear()
-        for picture, (height, width) in sizes.items():
-            image = rng.integers(256, size=(height, width, 3), dtype=np.uint8)
-            for lens in (
-                Equidistant(26.0, 1.5, image_size=(height, width)),
-                KannalaBrandt(
-                    24.0, [0.02], 1.5, [31.0, 35.0], image_size=(height, width), **GENERAL
-                ),
-            ):
-                answers.add({"image": picture}, image, lens)
-                answers.flush()
-                seen = ~pixel_angles(lens, (height, width))[0].isnan().numpy()
-                if fit == "crop":
-                    top, left, side = (height - 60) // 2, (width - 60) // 2, 60
-                    cut = np.ones_like(seen)
-                    cut[top : top + side, left : left + side] = False
-                    assert picture == "square" or (seen & cut).any()
-                    seen &= ~cut
-                file = str(tmp_path / answers.found[-1][answers.kind])
-                answered = cv2.imread(file, cv2.IMREAD_UNCHANGED)
-                if task == "segmentation":
-                    answered = ids(file) != 255
-                assert np.array_equal(answered > 0, seen)
-        said = [str(one.message) for one in recwarn if one.category is CutOff]
-        assert len(said) == (fit == "crop")
-        assert all("right of pictures of 84×60 px (" in text and "°" in text for text in said)
 
 
 def test_a_model_that_takes_squares_says_what_it_does_not_see(stub, labels, tmp_path, capsys):

@@ -64,30 +64,23 @@ REFUSED = {
         --network n.onnx --lens lens.json => missing --out
         --network n.onnx --model digits => give either --run, .* or --network, an ONNX file
         --network n.onnx --run r => give either --run, .* or --network, an ONNX file
-        --network n.onnx --up 0,1 => --up must be 3 numbers, such as 0.5,0.5,0.5, got \[0,1\]
-        --network n.onnx --mean a => --mean must be numbers, such as 0.5,1, got a
         --network n.onnx --channels grb => --channels must be one of rgb, bgr, got grb
         --network n.onnx --fov_deg wide => --fov_deg must be a number, got wide
     """,
     "predict p.png --lens lens.json --out new --network": r"""
+        n.onnx --out even.png => --out must be a folder for the pictures, but even.png is a file
         n.onnx --view fish => --view must be one of .*, mercator, .* got fish
         n.onnx --view polar => --view polar shows no picture to a network
         n.onnx --view mercator:3 => 'mercator' has no option 'count'; it has fov,
         n.onnx --view tiles:x => --view must be NAME or NAME:COUNT, .* got tiles:x
         n.onnx --view tiles:3 => count must be from 4 to 9, got 3
         n.onnx --view none --fov_deg 90 => 'none' has no option 'fov'
-        n.onnx --view none --up 0,0,1 => 'none' has no option 'up'
         n.onnx --fov_deg 0 => --fov_deg must be above 0° and at most 360° for a
-        n.onnx --view perspective --fov_deg 180 => --fov_deg .* at most 179.9° for a pers
-        n.onnx --fov_deg 400 => --fov_deg must be above 0°
-        n.onnx --up 0,0,0 => --up must be three finite numbers
         n.onnx --mean 123.7 => --mean must be in parts of 255, at most 1 \(.*\), got 123.7
         n.onnx --std 58.395,57.12,57.375 => parts of 255, .* 0.229,0.224,0.225\), got 58.395
-        n.onnx --std 255 => --std must be in parts of 255, at most 1 \(.* this is 1\)
         n.onnx --mean 0.1,0.2 => mean.*per channel
         n.onnx --std 0 => --std must be above 0
         n.onnx --std nan => --std must be finite, got nan
-        n.onnx --mean inf => --mean must be finite, got inf
         n.onnx --top 2 => --top is for the classes of pictures, but n.onnx is a model
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be finite, got nan
@@ -95,7 +88,6 @@ REFUSED = {
         n.onnx --task distance => --task is distance, but n.onnx is a model for detec
         n.onnx --height 2 => --height needs --up, the direction away from gravity
         n.onnx --radius 1 => --radius must be given with --height, got 1.0
-        n.onnx --height -1 --up=0,-1,0 => --height must be above 0 m, got -1
         n.onnx --height 2 --radius -1 --up=0,-1,0 => --radius must be at least 0 m
         n.onnx --height 2 --up=0,-1,0 --view square => no .*up
         maps.onnx --height 2 --up=0,-1,0 => --height is for boxes, but maps.onnx gives
@@ -104,8 +96,6 @@ REFUSED = {
         free.onnx --size 0,64 => --size must be at least 1,1, got \(0, 64\)
         bytes.onnx --std 0.2 => bytes.onnx takes pixels of uint8: leave --mean and --std
         gone.onnx => there is no file gone.onnx
-        p.png => onnxruntime cannot read p\.png
-        raw.onnx => raw.onnx has the outputs output0 \(1, 4, 11\); known are
     """,
     "warp set/instances.json --out new": r"""
         --to wide.json => missing --lens: .*instances.json has no calibration
@@ -116,14 +106,7 @@ REFUSED = {
         --to bare.json --lens wide.json => bare.json has no image_size: give --size
         --to {"model":"Perspective","fov_deg":70} --lens wide.json => needs the image_size
         --to tiles:x --lens wide.json => --to must be NAME or NAME:COUNT, such as tiles:5
-        --to tiles: --lens wide.json => --to must be NAME or NAME:COUNT, .* got tiles:
-        --to tiles:3 --lens wide.json => count must be from 4 to 9
-        --to mercator:2 --lens wide.json => has no option 'count'
-        --to polar --lens wide.json => shows no picture
         --to none --lens wide.json => --to none shows the picture as it is
-        --to mercator --lens wide.json --fov_deg 400 => --fov_deg must be above 0°
-        --to stereographic --lens wide.json --fov_deg 350 => --fov_deg .* at most 340° for a s
-        --to mercator --lens wide.json --up 0,0,0 => --up must be three finite numbers
         --to mercator --lens wide.json --up 0,1 => --up must be three finite numbers
     """,
     "warp --to mercator --lens wide.json": r"""
@@ -159,13 +142,10 @@ REFUSED = {
         --fov_deg 0 => --fov_deg must be above 0° and at most 179.9° for a perspective view
         --fov_deg=180 => --fov_deg must be above 0° and at most 179.9° .*, got 180
         --view=stereographic --fov_deg=341 => at most 340° for a stereographic view
-        --view=cylindrical --fov_deg=361 => at most 360° for a cylindrical view
         --view=panorama --fov_deg=90 => --fov_deg must be 360° for a panorama view, got 90
         --view=square --pitch_deg=9 => --pitch_deg must be 0 for a square view, which
         --up=0,0,0 => --up must be three finite .*, got \(0.0, 0.0, 0.0\)
-        --up=0,.inf,0 => --up must be 3 numbers, such as 0.5,0.5,0.5, got 0,.inf,0
         --up=0,1e999,2 => --up must be three finite numbers
-        --up=0,1 => --up must be 3 numbers, such as 0.5,0.5,0.5, got
         --yaw_deg=inf => --yaw_deg must be from -360° to 360°, got inf
         --theta_max_deg=0 => --theta_max_deg must be above 0° and at most 180°, got 0
         --rings=100000000 => --rings must be from 1 to 1024, got 100000000
@@ -175,8 +155,6 @@ REFUSED = {
         --out=lens.gif => must end in one of \.png, \.jpg, .*, got 'lens.gif'
     """,
     "lens undistort --coefficients=fisheye kd.json": r"""
-        in --fov=180 --out=out => --fov_deg must be above 0° and at most 179.9° for a pers
-        in --view=square --yaw_deg=20 --out=out => looks along the optical axis, got 20
         in --view=square --up=0,-1,0 --out=out => --up must be left out for a square view
         in --view=fisheye --out=out => --view must be one of cylindrical, equirectangular
         in --theta_max_deg=0 --out=out => --theta_max_deg must be above 0°
@@ -199,7 +177,6 @@ REFUSED = {
         --board=9 --square=1 => --board must be columns and rows from 3 to 100, such as
         --board=2x6 --square=1 => --board must be columns and rows from 3 to 100
         --board=9x6 --square=0 => --square must be positive, got 0
-        --board=9x6 --square=.nan => --square must be
         --board=9x6 => required: --square
     """,
     "lens calibrate --board=6x5 --square=0.03 --model=Mei": r"""
@@ -369,7 +346,6 @@ def networks(world):
     write_graph(world / "n.onnx", size=(64, 64))
     write_graph(world / "free.onnx")
     write_graph(world / "bytes.onnx", size=(64, 64), dtype="uint8")
-    write_graph(world / "raw.onnx", "undecoded", size=(64, 64))
     write_constants(world / "maps.onnx", (64, 64), maps=np.zeros((1, 2, 64, 64), np.float32))
 
 
