@@ -236,7 +236,7 @@ def test_errors_show_names_of_files_as_they_are(capsys):
     folder.mkdir(parents=True)
     (folder / "two.yaml").write_text((FILES / "kalibr_tumvi.yaml").read_text())
     for argv, said in (
-        (["lens", "info", str(folder / "none.json")], f"no such file: {folder}/none.json"),
+        (["lens", "info", str(folder / "none.json")], f"{folder}/none.json: there is no such file"),
         (["fit", "--run", "r", "--data.path", str(folder / "none")], f"no folder {folder}/none"),
         (["lens", "crop", str(folder / "two.yaml"), "o", "--size", "9,9"],
          f"{folder}/two.yaml has several cameras, choose one with --camera: 'cam0'"),

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers import slow_but
 from PIL import Image
 from runs import PIXELS, QUIET, UNET, error, fit
 from scenes import write_plain
@@ -88,7 +89,7 @@ def test_what_is_wrong_with_the_data_has_the_names_of_the_runs_configuration(dig
         (digits / "config.yaml").write_text(config)
 
 
-@pytest.mark.parametrize("task", ["segmentation", "distance"])
+@pytest.mark.parametrize("task", slow_but(["segmentation", "distance"], "segmentation"))
 def test_models_of_pixels(tmp_path, task, capsys):
     data, run = write_plain(tmp_path / "scenes", 20, size=(45, 60)), tmp_path / "run"
     fit(run, "--task", task, "--data.path", data, *PIXELS, *FAST, "--trainer.max_epochs", "2")
