@@ -12,7 +12,6 @@ import pytest
 import torch
 from calibrate_boards import Renderer
 from helpers import slow_but
-from matplotlib.figure import Figure
 from PIL import ExifTags, Image
 
 from darswin import lens
@@ -121,6 +120,8 @@ def test_a_folder_as_people_have_it(folder, capsys, monkeypatch, orientation):
     shutil.copy("boards/2.png", "boards/copy.png")
     for k in "xy":
         (folder / f"boards/{k}.png").write_bytes(b"no picture")
+    from matplotlib.figure import Figure
+
     drawn = []
     draw = "darswin.viz.calibration.draw_calibration"
     monkeypatch.setattr(draw, lambda *given: drawn.append(given) or Figure((1, 1)))

@@ -2,21 +2,20 @@
 
 import inspect
 import re
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 import torch
 import yaml
-from lightning.pytorch import Trainer
 from runs import QUIET, error, fit
 from scenes import write_plain
 
 from darswin.cli.main import COMMANDS, main
 from darswin.cli.options import PRESETS, complete, flag_of
 from darswin.models import load_model
-from darswin.train import data
-from darswin.train.tasks import TASKS
+from darswin.utils.tasks import Task
 
 DIGITS = ["--config", "minutes", "--data.path", "digits", "--trainer.logger", "false", *QUIET]
 
@@ -88,7 +87,8 @@ def test_all_broken_files_are_named_before_the_training(capsys, tmp_path):
 def test_each_split_is_checked_once(tmp_path, monkeypatch):
     checked = []
     monkeypatch.setattr(
-        data, "check_files", lambda parts: checked.extend(parts) or dict.fromkeys(parts, 0)
+        "darswin.train.data.check_files",
+        lambda parts: checked.extend(parts) or dict.fromkeys(parts, 0),
     )
     options = [*DIGITS, "--trainer.max_steps", "1", "--data.limit", "48"]
     fit(tmp_path / "a", *options, "--trainer.limit_val_batches", "1")
@@ -189,6 +189,8 @@ def options_in(text):
 
 def own(task):
     """All options of the data and of the model: those of their classes and of the bases."""
+    from darswin.train.tasks import TASKS  # imports Lightning
+
     for group, made in (("data", TASKS[task].data), ("model", TASKS[task].module)):
         for part in (c for c in made.__mro__ if c.__module__.startswith("darswin.")):
             for name, parameter in inspect.signature(part).parameters.items():
@@ -196,7 +198,7 @@ def own(task):
                     yield f"{group}.{name}"
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", get_args(Task))
 def test_our_options_come_first_and_none_is_missing(capsys, task):
     text = shown(capsys, "fit", "--task", task, "--help")
     lines, names = text.splitlines(), options_in(text)
@@ -217,6 +219,8 @@ def test_our_options_come_first_and_none_is_missing(capsys, task):
 
 
 def test_all_has_everything(capsys):
+    from lightning.pytorch import Trainer
+
     texts = [shown(capsys, "test", flag) for flag in ("--help", "--help.all")]
     few, every = map(options_in, texts)
     assert texts[0].startswith("usage: darswin test --run RUN [options]")

@@ -21,7 +21,6 @@ from lens_examples import FILES, FRONT
 from darswin.cli.main import main
 from darswin.lens import Perspective, from_dict, to_dict
 from darswin.views.registry import flat_views
-from darswin.viz import plot
 
 
 @pytest.fixture(autouse=True)
@@ -48,8 +47,8 @@ def lens(capsys):
 def shown(monkeypatch):
     """The arguments with which figures are drawn, which are not."""
     calls = []
-    monkeypatch.setattr(plot, "draw_lens", lambda *arguments: calls.append(arguments))
-    monkeypatch.setattr(plot, "save_figure", lambda figure, out: None)
+    monkeypatch.setattr("darswin.viz.plot.draw_lens", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, out: None)
     return calls
 
 
@@ -213,8 +212,8 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
 
     code, out, err = 0, io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
-        patch.setattr(plot, "draw_lens", draw)
-        patch.setattr(plot, "save_figure", lambda figure, out: None)
+        patch.setattr("darswin.viz.plot.draw_lens", draw)
+        patch.setattr("darswin.viz.plot.save_figure", lambda figure, out: None)
         with contextlib.redirect_stderr(err):
             try:
                 main(argv)
