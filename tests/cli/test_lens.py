@@ -176,20 +176,23 @@ OPTIONS = st.one_of(
 )  # fmt: skip
 EXTREMES = st.sampled_from([1e-300, 1e-30, 1e-9, 0.5, 1.0, 100.0, 1e30, 1e300])
 LENSES = st.builds(
-    lambda model, center, affine, size, theta: {**model, "theta_max": theta} | {
-        name: value for name, value in (("center", center), ("affine", affine),
-                                        ("image_size", size)) if value is not None},
+    dict.__or__,
     st.one_of(
-        st.builds(lambda f: {"model": "Perspective", "focal": f}, EXTREMES),
-        st.builds(lambda f, k: {"model": "KannalaBrandt", "focal": f, "radial": [k]},
-                  EXTREMES, st.sampled_from([0, 0.01, 1e300, -1.0])),
-        st.builds(lambda f, xi: {"model": "Mei", "focal": f, "xi": xi, "radial": [0, 0]},
-                  EXTREMES, EXTREMES),
+        st.fixed_dictionaries({"model": st.just("Perspective"), "focal": EXTREMES}),
+        st.fixed_dictionaries({"model": st.just("KannalaBrandt"), "focal": EXTREMES,
+                               "radial": st.sampled_from([[0], [0.01], [1e300], [-1.0]])}),
+        st.fixed_dictionaries({"model": st.just("Mei"), "focal": EXTREMES, "xi": EXTREMES,
+                               "radial": st.just([0, 0])}),
     ),
-    st.sampled_from([None, [0, 0], [-100.0, 50.0], [1e300, -1e300]]),
-    st.sampled_from([None, [[1, 0.1], [0, 0.5]], [[1e300, 0], [0, 1]], [[1, 0], [0, 1e-300]]]),
-    st.sampled_from([None, [30, 40], [30, 40], [1, 1]]),
-    st.sampled_from([1e-300, 1e-9, 0.1, 1.0, 1.5, 1.6, 3.14159]),
+    st.fixed_dictionaries(
+        {"theta_max": st.sampled_from([1e-300, 1e-9, 0.1, 1.0, 1.5, 1.6, 3.14159])},
+        optional={
+            "center": st.sampled_from([[0, 0], [-100.0, 50.0], [1e300, -1e300]]),
+            "affine": st.sampled_from([[[1, 0.1], [0, 0.5]], [[1e300, 0], [0, 1]],
+                                       [[1, 0], [0, 1e-300]]]),
+            "image_size": st.sampled_from([[30, 40], [1, 1]]),
+        },
+    ),
 )  # fmt: skip
 
 
