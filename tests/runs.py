@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from darswin.cli.main import main
-from darswin.train.task import TaskModule
 
 QUIET = """--data.workers 0 --trainer.enable_progress_bar false
     --trainer.enable_model_summary false""".split()  # noqa: SIM905
@@ -73,16 +72,15 @@ class KilledError(BaseException):
     """Nothing that the program knows, as a kill is."""
 
 
-STEP = TaskModule.training_step
-
-
 def patch_batch(monkeypatch, number: int, action) -> None:
     """The n-th batch of the next `fit` begins with an action, which may give it another loss."""
-    counts = itertools.count(1)
+    from darswin.train.task import TaskModule  # takes seconds
+
+    counts, step = itertools.count(1), TaskModule.training_step
 
     def acting(self, batch, batch_idx):
         other = action(self) if next(counts) == number else None
-        return STEP(self, batch, batch_idx) if other is None else other
+        return step(self, batch, batch_idx) if other is None else other
 
     monkeypatch.setattr(TaskModule, "training_step", acting)
 
@@ -93,7 +91,6 @@ def killed_fit(monkeypatch, run: Path, number: int, *options) -> None:
     def kill(self):
         raise KilledError
 
-    patch_batch(monkeypatch, number, kill)
-    with pytest.raises(KilledError):
+    with monkeypatch.context() as patch, pytest.raises(KilledError):
+        patch_batch(patch, number, kill)
         fit(run, *options)
-    monkeypatch.setattr(TaskModule, "training_step", STEP)

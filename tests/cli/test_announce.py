@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from runs import DIGITS, checkpoint, fit, test
 
-from darswin.cli.announce import FEW_STEPS, shortfalls
-
 
 def write_stripes(folder, **counts):
     """Pictures of stripes in four directions, the classes; of random colours, widths and phases."""
@@ -76,14 +74,16 @@ def test_a_used_up_time_limit_is_named(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("steps", "warmup", "said"),
     [
-        (FEW_STEPS, 5, []),
-        (FEW_STEPS - 1, 0, ["99 steps are too few"]),
+        (100, 5, []),
+        (99, 0, ["99 steps are too few"]),
         (1000, 50, []),
         (1000, 50.1, ["the learning rate rises during 501 of the 1000 steps"]),
         (10, 20, ["10 steps are too few", "rises during 10 of the 10 steps"]),
     ],
 )
 def test_schedules_that_are_too_short(steps, warmup, said):
+    from darswin.cli.announce import shortfalls  # imports Lightning
+
     found = shortfalls(SimpleNamespace(steps=steps, warmup_epochs=warmup, steps_per_epoch=10))
     assert len(found) == len(said)
     assert all(part in text for part, text in zip(said, found, strict=True))

@@ -1,6 +1,5 @@
 """Answers to a stream of images: classes, and files of a network whose answer is known."""
 
-import itertools
 import json
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import slow_but
+from helpers import refused
 from PIL import Image
 from videos import write_video
 
@@ -17,8 +16,6 @@ from darswin.cli import answers as module
 from darswin.cli import predict as predict_module
 from darswin.cli.answers import (
     ClassAnswers,
-    DistanceAnswers,
-    LabelAnswers,
     distance_png,
     label_png,
 )
@@ -26,14 +23,10 @@ from darswin.cli.main import main
 from darswin.cli.pictures import claim_folder, file_names
 from darswin.cli.predict import ANSWERS as RECORD
 from darswin.data import FullSize, fitted
-from darswin.data.framing import CutOff
-from darswin.lens import Equidistant, KannalaBrandt, from_dict
-from darswin.lens.pixels import pixel_angles
+from darswin.lens import from_dict
 from darswin.models.encoder import Encoder
 from darswin.models.prepared import Prepared
-from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, save_model
-from darswin.train.finetuning import models_for
 from darswin.views.base import PreparedPixels
 from darswin.viz.pixels import UNKNOWN, palette
 
@@ -102,8 +95,9 @@ class Stub(Encoder):
 
 
 @pytest.fixture
-def stub(monkeypatch):
-    """A function that makes `predict` take a stub for a task."""
+def stub(tmp_path, monkeypatch):
+    """A function that makes `predict` take a stub for a task; the current folder is a new one."""
+    monkeypatch.chdir(tmp_path)
 
     def install(task, **card):
         net = Stub(task)
@@ -121,10 +115,9 @@ def picture_of(labels):
     return np.take(np.array(COLORS, np.uint8), labels, 0)
 
 
-def write(path, image):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), image[..., ::-1])
-    return str(path)
+def write(name, image):
+    Path(name).parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(name, image[..., ::-1])
 
 
 @pytest.fixture
@@ -135,12 +128,10 @@ def labels():
     return labels
 
 
-def predict(*argv, out, lens=LENS):
-    lens = json.dumps(lens) if isinstance(lens, dict) else str(lens)
-    main(
-        ["predict", *map(str, argv), "--model", "m.safetensors", "--lens", lens, "--out", str(out)]
-    )
-    return json.loads((Path(out) / "predictions.json").read_text())
+def predict(command, lens=LENS):
+    given = ["--model", "m.safetensors", "--lens", json.dumps(lens)]
+    main(["predict", *command.split(), *given, "--out", "out"])
+    return json.loads(Path("out/predictions.json").read_text())
 
 
 def ids(path):
@@ -154,38 +145,37 @@ def colored(path):
         return np.asarray(image.convert("RGB"))
 
 
-def test_labels_of_a_picture(stub, labels, tmp_path):
+def test_labels_of_a_picture(stub, labels):
     stub("segmentation")
-    image, out = picture_of(labels), tmp_path / "out"
-    picture = write(tmp_path / "p.png", image)
-    (answer,) = predict(picture, out=out)
-    assert answer["image"] == picture
+    image = picture_of(labels)
+    write("p.png", image)
+    (answer,) = predict("p.png")
+    assert answer["image"] == "p.png"
     assert (answer["labels"], answer["overlay"]) == ("labels/p.png", "overlays/p.jpg")
-    assert np.array_equal(ids(out / "labels/p.png"), np.where(SEEN, labels, 255))
-    colors = colored(out / "labels/p.png")
+    assert np.array_equal(ids("out/labels/p.png"), np.where(SEEN, labels, 255))
+    colors = colored("out/labels/p.png")
     assert (colors[SEEN] == image[SEEN]).all() and (colors[~SEEN] == UNKNOWN).all()
     shares = {name: (labels[SEEN] == k).mean() for k, name in enumerate(NAMES)}
     assert answer["shares"] == pytest.approx(shares, abs=1e-6) and list(shares) == NAMES
     assert answer["unanswered"] == pytest.approx((~SEEN).mean(), abs=1e-6)
     # Classes without names and colours; the overlay is half of the colour, where there is one.
     stub("segmentation", classes=(), colors=[])
-    (answer,) = predict(picture, out=out)
+    (answer,) = predict("p.png")
     assert list(answer["shares"]) == ["0", "1", "2"]
-    assert colored(out / "labels/p.png")[24, 24].tolist() == (laid := palette(3)[0])
-    overlay = cv2.imread(str(out / "overlays/p.jpg"))[..., ::-1].astype(int)
+    assert colored("out/labels/p.png")[24, 24].tolist() == (laid := palette(3)[0])
+    overlay = cv2.imread("out/overlays/p.jpg")[..., ::-1].astype(int)
     middle = np.s_[16:32, 18:26]  # away from edges, which JPEG blurs
     assert np.abs(overlay - (image.astype(int) + laid) // 2)[middle].max() < 12
     assert np.abs(overlay - image)[:, :4].max() < 12
 
 
-def test_distances_of_a_picture(stub, tmp_path):
+def test_distances_of_a_picture(stub):
     stub("distance")
     red = np.tile(np.linspace(40, 240, 64).astype(np.uint8), (48, 1))
-    image = np.stack((red, red, red), -1)
-    out = tmp_path / "out"
-    (answer,) = predict(write(tmp_path / "p.png", image), "--task", "distance", out=out)
+    write("p.png", np.stack((red, red, red), -1))
+    (answer,) = predict("p.png --task distance")
     assert answer["distance"] == "distance/p.png"
-    steps = cv2.imread(str(out / "distance/p.png"), cv2.IMREAD_UNCHANGED)
+    steps = cv2.imread("out/distance/p.png", cv2.IMREAD_UNCHANGED)
     assert steps.dtype == np.uint16 and steps.shape == (48, 64)
     expected = np.where(SEEN, red / 4, 0)
     np.testing.assert_allclose(steps / 256, expected, atol=0.5 / 256)
@@ -196,7 +186,7 @@ def test_distances_of_a_picture(stub, tmp_path):
     assert answer["unanswered"] == pytest.approx((~SEEN).mean(), abs=1e-6)
     near, far = answer["colors_m"]
     assert known.min() <= near < far <= known.max()
-    laid = cv2.imread(str(out / "overlays/p.jpg"))
+    laid = cv2.imread("out/overlays/p.jpg")
     assert laid.shape == (48, 64, 3) and np.ptp(laid[24], 1).max() > 30  # colours over grey
 
 
@@ -211,7 +201,7 @@ def test_pngs_keep_every_value(tmp_path):
 
 
 @pytest.mark.parametrize(("task", "value"), [("segmentation", np.nan), ("distance", np.inf)])
-def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task, value):
+def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, task, value):
     net = stub(task)
     run, reached = net.run, torch.ones(48, 48, dtype=torch.bool)
 
@@ -221,45 +211,47 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task,
         return output
 
     monkeypatch.setattr(net, "run", broken)
-    pictures = [write(tmp_path / f"{k}.png", np.full((48, 64, 3), 50, np.uint8)) for k in (0, 1)]
-    with pytest.raises(SystemExit, match=f"darswin: no prediction for {pictures[1]}: .* NaN or"):
-        predict(*pictures, out=tmp_path / "out")
-    found = json.loads((tmp_path / "out" / "predictions.json").read_text())
-    assert [answer["image"] for answer in found] == pictures[:1]  # what was found is not lost
+    for name in ("0.png", "1.png"):
+        write(name, np.full((48, 64, 3), 50, np.uint8))
+    with pytest.raises(SystemExit, match=r"darswin: no prediction for 1\.png: .* NaN or"):
+        predict("0.png 1.png")
+    found = json.loads(Path("out/predictions.json").read_text())
+    assert [answer["image"] for answer in found] == ["0.png"]  # what was found is not lost
     reached = ~torch.from_numpy(FULL.reached)  # beyond θ_max it has no meaning
-    assert len(predict(*pictures, out=tmp_path / "out")) == 2
+    assert len(predict("0.png 1.png")) == 2
 
 
-def test_a_folder_means_pictures_and_videos(stub, labels, tmp_path, capsys):
+def test_a_folder_means_pictures_and_videos(stub, labels, capsys):
     net = stub("segmentation")
-    folder, out = tmp_path / "in", tmp_path / "in" / "out"
     for name in ("front/1.png", "rear/1.png", "rear/deep/2.jpg"):
-        write(folder / name, picture_of(labels if "front" in name else labels[:, ::-1]))
-    frames = write_video(folder / "rear/drive.avi", 5, size=(48, 64), codec="MJPG")
-    *found, speed = predict(folder, "--every", "2", out=out)
+        write(f"in/{name}", picture_of(labels if "front" in name else labels[:, ::-1]))
+    frames = write_video(Path("in/rear/drive.avi"), 5, size=(48, 64), codec="MJPG")
+    Path("out").symlink_to("in/out")
+    Path("in/out").mkdir()
+    *found, speed = predict("in --every 2")
     files = [answer["labels"] for answer in found]
     assert files == [
         "labels/front/1.png", "labels/rear/1.png", "labels/rear/deep/2.png",
         *(f"labels/rear/drive.avi/{k:06}.png" for k in (0, 2, 4)),
     ]  # fmt: skip
-    assert all((out / answer["overlay"]).exists() for answer in found)
-    assert [ids(out / name)[24, 20] for name in files[:2]] == [0, 2]
+    assert all(Path("out", answer["overlay"]).exists() for answer in found)
+    assert [ids(f"out/{name}")[24, 20] for name in files[:2]] == [0, 2]
     middle = np.s_[16:32, 24:40]
     for answer, k in zip(found[3:], (0, 2, 4), strict=True):
-        same = ids(out / answer["labels"])[middle] == frames[k][middle].argmax(-1)
+        same = ids(f"out/{answer['labels']}")[middle] == frames[k][middle].argmax(-1)
         assert answer["frame"] == k and same.mean() > 0.9
     assert speed["frames"] == 3 and "3 frames at" in capsys.readouterr().err
     assert net.prepared == 1  # one lens
     # Its own pictures are not predicted again, unless they are asked for.
-    assert len(predict(folder, "--every", "2", out=out)) == len(found) + 1
-    assert predict(out / files[0], out=tmp_path / "again")
+    assert len(predict("in --every 2")) == len(found) + 1
+    assert predict(f"in/out/{files[0]}")
 
 
-def test_colours_of_distance_stay_for_a_video(stub, tmp_path):
+def test_colours_of_distance_stay_for_a_video(stub):
     stub("distance")
-    write_video(tmp_path / "v.avi", 4, size=(48, 64), codec="MJPG")
-    write(tmp_path / "p.png", np.full((48, 64, 3), 40, np.uint8))
-    *frames, _, picture = predict(tmp_path / "v.avi", tmp_path / "p.png", out=tmp_path / "out")
+    write_video(Path("v.avi"), 4, size=(48, 64), codec="MJPG")
+    write("p.png", np.full((48, 64, 3), 40, np.uint8))
+    *frames, _, picture = predict("v.avi p.png")
     assert len({tuple(answer["colors_m"]) for answer in frames}) == 1
     assert picture["colors_m"] != frames[0]["colors_m"]
 
@@ -286,124 +278,55 @@ def test_names_of_files_differ_and_keep_their_folders(
     assert file_names(paths, [(name, name in videos) for name in expected]) == expected
 
 
-def test_nothing_but_its_own_is_replaced(tmp_path):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in/p.png").touch()
-    (tmp_path / "list").mkdir()
-    (tmp_path / "list/predictions.json").write_text('{"mine": 1}')
-    for out, said in ((None, "missing --out"), ("in", "holds other files"),
-                      ("in/p.png", "is a file"), ("list", "holds other files")):  # fmt: skip
-        with pytest.raises(ValueError, match=said):
-            claim_folder(out and str(tmp_path / out), RECORD)
-    assert [path.name for path in (tmp_path / "in").iterdir()] == ["p.png"]
-    (tmp_path / "empty").mkdir()
-    for out in ("empty", "new/out"):
-        assert claim_folder(str(tmp_path / out), RECORD) == tmp_path / out
-        assert json.loads((tmp_path / out / "predictions.json").read_text()) == []
-        (tmp_path / out / "labels").mkdir()  # of a run that was killed
-        claim_folder(str(tmp_path / out), RECORD)
+def test_a_record_of_another_program_is_not_replaced(tmp_path):
+    (tmp_path / "predictions.json").write_text('{"mine": 1}')
+    refused("holds other files", claim_folder, str(tmp_path), RECORD)
+    (tmp_path / "predictions.json").write_text("[]")
+    (tmp_path / "labels").mkdir()  # of a run that was killed
+    assert claim_folder(str(tmp_path), RECORD) == tmp_path
 
 
-def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
-    picture = write(tmp_path / "p.png", picture_of(labels))
-    net = stub("segmentation")
-    argv = ["predict", picture, "--model", "m.safetensors", "--lens", json.dumps(LENS)]
-    with pytest.raises(SystemExit, match="missing --out"):
-        main(argv)
-    with pytest.raises(SystemExit, match=r"--task is distance, but m\.safetensors is a model"):
-        main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
-    net.num_classes = 256
+def test_more_classes_than_a_png_holds_are_refused(stub, labels):
+    stub("segmentation").num_classes = 256
+    write("p.png", picture_of(labels))
     with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
-        main([*argv, "--out", str(tmp_path / "o")])
+        predict("p.png")
 
 
-def test_a_real_model_answers_as_in_python(tmp_path):
-    size = 128
+def test_a_real_model_answers_as_in_python(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     options = dict(task="segmentation", num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
-    name, more = "darswin_unet_a_nano", dict(fit="crop", task="segmentation", colors=COLORS)
-    card = ModelCard(name, options, NAMES, size, **more)
+    more = dict(fit="crop", task="segmentation", colors=COLORS)
+    card = ModelCard("darswin_unet_a_nano", options, NAMES, 128, **more)
     model = card.create().eval()
-    save_model(tmp_path / "m.safetensors", model.state_dict(), card)
+    save_model("m.safetensors", model.state_dict(), card)
     rng = np.random.default_rng(0)
     image = cv2.resize(rng.integers(256, size=(9, 12, 3), dtype=np.uint8), (160, 140))
-    picture, out = write(tmp_path / "p.png", image), tmp_path / "out"
+    write("p.png", image)
     lens = LENS | {"image_size": [140, 160]}
-    argv = ["predict", picture, "--model", str(tmp_path / "m.safetensors"), "--out", str(out)]
-    main([*argv, "--lens", json.dumps(lens)])
-    remap = fitted((140, 160), size, "crop").at(from_dict(lens), (140, 160))
+    predict("p.png", lens)
+    remap = fitted((140, 160), 128, "crop").at(from_dict(lens), (140, 160))
     with torch.no_grad():
         output = model(torch.from_numpy(remap(image))[None], remap.camera)[0].numpy()
-    expected = FullSize(remap).labels(output)
-    assert (ids(out / "labels/p.png") == expected).mean() > 0.998
+    assert (ids("out/labels/p.png") == FullSize(remap).labels(output)).mean() > 0.998
 
 
-KINDS = [name for name in models_for("segmentation") if name.endswith("nano")]
-GENERAL = dict(tangential=[0.02, -0.01], affine=[[1.0, 0.05], [0.0, 0.9]])
-
-
-ANSWERS = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
-
-
-@pytest.mark.parametrize(
-    ("name", "task"),
-    slow_but([*itertools.product(KINDS, ANSWERS)], ("swin_unet_nano", "distance"),
-             ("darswin_unet_a_nano", "segmentation")),
-)  # fmt: skip
-def test_every_pixel_that_a_ray_reaches_has_an_answer(name, task, tmp_path, recwarn):
-    """Of square, wide and tall pictures, of lenses whose circle is cut, shifted or sheared."""
-    answers_of = ANSWERS[task]
-    options = dict(task=task, num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
-    if has_image_size(name):
-        options["image_size"] = 64
-    sizes = {"square": (60, 60), "wide": (60, 84), "tall": (84, 60)}
-    rng = np.random.default_rng(0)
-    for fit in ("stretch", "crop"):
-        card = ModelCard(name, options, NAMES if task == "segmentation" else (), 64, 0.0, fit, task)
-        answers = answers_of(card.create().eval(), card, tmp_path, {p: p for p in sizes})
-        recwarn.clear()
-        for picture, (height, width) in sizes.items():
-            image = rng.integers(256, size=(height, width, 3), dtype=np.uint8)
-            for lens in (
-                Equidistant(26.0, 1.5, image_size=(height, width)),
-                KannalaBrandt(
-                    24.0, [0.02], 1.5, [31.0, 35.0], image_size=(height, width), **GENERAL
-                ),
-            ):
-                answers.add({"image": picture}, image, lens)
-                answers.flush()
-                seen = ~pixel_angles(lens, (height, width))[0].isnan().numpy()
-                if fit == "crop":
-                    top, left, side = (height - 60) // 2, (width - 60) // 2, 60
-                    cut = np.ones_like(seen)
-                    cut[top : top + side, left : left + side] = False
-                    assert picture == "square" or (seen & cut).any()
-                    seen &= ~cut
-                file = str(tmp_path / answers.found[-1][answers.kind])
-                answered = cv2.imread(file, cv2.IMREAD_UNCHANGED)
-                if task == "segmentation":
-                    answered = ids(file) != 255
-                assert np.array_equal(answered > 0, seen)
-        said = [str(one.message) for one in recwarn if one.category is CutOff]
-        assert len(said) == (fit == "crop")
-        assert all("right of pictures of 84×60 px (" in text and "°" in text for text in said)
-
-
-def test_a_model_that_takes_squares_says_what_it_does_not_see(stub, labels, tmp_path, capsys):
+def test_a_model_that_takes_squares_says_what_it_does_not_see(stub, labels, capsys):
     """Once, whatever it was trained on; only the old file's card asks for a new training."""
-    pictures = [write(tmp_path / f"{k}.png", picture_of(labels)) for k in range(3)]
+    for k in range(3):
+        write(f"in/{k}.png", picture_of(labels))
     lens = {"model": "Equidistant", "focal": 30, "theta_max": 1.5, "image_size": [48, 64]}
     for fit, reason in (
         ("crop", "it was trained on cropped pictures; `darswin fit --data.fit stretch` trains one"),
         ("whole", "it takes only square pictures"),
         ("stretch", None),
     ):
-        net = stub("segmentation", fit=fit)
-        assert net.square_images
-        predict(*pictures, out=tmp_path / "out", lens=lens)
+        assert stub("segmentation", fit=fit).square_images
+        predict("in", lens)
         said = [line for line in capsys.readouterr().err.splitlines() if "does not see" in line]
         assert len(said) == (reason is not None)
         for line in said:
             assert line.startswith("darswin: the model does not see 8 px at the left and 8 px at")
             assert reason in line
-    predict(*pictures, out=tmp_path / "out")  # a circle inside the square
+    predict("in")  # a circle inside the square
     assert "does not see" not in capsys.readouterr().err

@@ -74,14 +74,3 @@ def test_closed_streams_are_no_place_for_files(tmp_path):
     )
     line = f'"{sys.executable}" -c "{script}" {tmp_path / "a"} <&- >&- 2>&-'
     assert subprocess.run(["sh", "-c", line]).returncode == 0
-
-
-def test_a_stop_by_the_keyboard_has_its_code_and_no_traceback(monkeypatch, capsys):
-    def stopped():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("darswin.cli.info.models", stopped)
-    with pytest.raises(SystemExit) as caught:
-        main(["models"])
-    assert caught.value.code == 130 and caught.value.__suppress_context__
-    assert capsys.readouterr() == ("", "")
