@@ -29,7 +29,7 @@ demo: build  ## train on nearly undistorted digits, test through fisheye lenses,
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
 # The tests of what is compiled: other tiers, compilers and sanitizers run them too.
-COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/test_frame*.py $(ROOT)/tests/deploy/test_contract.py \
+COMPILED := $(ROOT)/tests/ops $(ROOT)/tests/frames $(ROOT)/tests/deploy/test_contract.py \
   $(ROOT)/tests/deploy/test_record.py
 PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
@@ -116,7 +116,7 @@ FUZZ := $(ROOT)/$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=
 fuzz: sanitized  ## call the operators with hostile arguments, read 100,000 wrong calibrations and 250,000 wrong files of cameras (45 minutes)
 	$(FUZZ) tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
 	cd $(SANITIZED); $(SANITIZER) $(FUZZ) -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
-	  $(ROOT)/tests/test_frame_files.py
+	  $(ROOT)/tests/frames/test_tensor_file.py
 
 kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py

@@ -3,7 +3,7 @@ import shutil
 
 import pytest
 import torch
-from frames import CALIBRATIONS, WOODSCAPE
+from lens_pictures import CALIBRATIONS, WOODSCAPE
 
 from darswin.data import Calibrations
 from darswin.lens import Tabulated, from_dict, load, load_all

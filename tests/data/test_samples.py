@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from helpers import slow_but
+from lens_pictures import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from PIL import ExifTags, Image
 from scenes import write_plain
 from torch.utils.data import DataLoader

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import blob, centroid, warped
+from lens_pictures import blob, centroid, warped
 
 from darswin.data import (
     PolynomialLenses,

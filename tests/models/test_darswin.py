@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import at_size
+from lens_pictures import at_size
 
 from darswin import create_model
 from darswin.lens import Equidistant, KannalaBrandt, Spherical

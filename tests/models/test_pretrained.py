@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import at_size
+from lens_pictures import at_size
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 

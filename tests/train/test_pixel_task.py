@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from frames import WOODSCAPE
+from lens_pictures import WOODSCAPE
 from scenes import write_plain
 
 from darswin.data import IGNORE

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from frames import WOODSCAPE
+from lens_pictures import WOODSCAPE
 from lightning.pytorch.strategies import Strategy
 from runs import (
     DIGITS,

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from frames import WOODSCAPE, write_frames
+from lens_pictures import WOODSCAPE, write_frames
 from runs import DIGITS, error
 from scenes import write, write_plain
 from torch import nn

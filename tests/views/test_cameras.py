@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from frames import blob, centroid
 from hypothesis import given
 from hypothesis import strategies as st
+from lens_pictures import blob, centroid
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from frames import at_size
+from lens_pictures import at_size
 from scenes import write_plain
 from torch.utils.data import DataLoader
 

@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from frame_samples import MEAN, STD, bilinear, by_numpy, random_frame
-from hypothesis import given
-from hypothesis import strategies as st
+from frame_samples import MEAN, STD, bilinear, random_frame
 
 from darswin import frames
 from darswin.deploy import camera
@@ -17,39 +15,6 @@ from darswin.views import make_view
 
 SIZE = (120, 160)
 LENS = KannalaBrandt(40.0, [0.01], math.radians(95), center=[81.0, 58.0])
-
-
-@st.composite
-def plans(draw):
-    """A plan with points inside, at the border and outside of its frame."""
-    height, width = draw(st.sampled_from((1, 2, 3, 16, 50))), draw(st.sampled_from((1, 2, 7, 60)))
-    reads = draw(st.sampled_from((1, 2, 3, 5, 16)))
-    shape = (draw(st.sampled_from((1, 2, 9))), draw(st.sampled_from((1, 3, 40))))
-    if draw(st.booleans()):
-        shape = (draw(st.integers(1, 4)), *shape)
-    shape += (reads**2,) * (reads > 1)
-    rng = np.random.default_rng(draw(st.integers(0, 99)))
-    columns, rows = (rng.integers(-1, side, shape, dtype=np.int16) for side in (width, height))
-    outside = rng.random(shape) < draw(st.sampled_from((0.0, 0.01, 1.0)))
-    columns, rows = (np.where(outside, np.int16(-3), places) for places in (columns, rows))
-    right, lower = rng.random((2, *shape), dtype=np.float32)
-    output = draw(st.sampled_from(("image", "uint8")))
-    gray = draw(st.booleans())
-    mean, std = ((0.3,), (0.7,)) if gray else (MEAN, STD)
-    plan = frames.Plan(columns, rows, right, lower, (height, width), output, mean, std, reads)
-    return plan, random_frame(height, width, *(() if gray else (3,)), seed=draw(st.integers(0, 9)))
-
-
-@given(plans(), st.integers(1, 4))
-def test_pixels_are_the_means_of_their_points(call, threads):
-    plan, frame = call
-    sampler = frames.Sampler(plan)
-    found, expected = sampler(frame, threads=threads), by_numpy(plan, frame)
-    assert found.shape == expected.shape
-    np.testing.assert_allclose(found, expected, atol=0.51 if plan.output == "uint8" else 2e-5)
-    out = np.empty_like(found)
-    assert sampler(frame, out) is out
-    np.testing.assert_array_equal(out, found)  # on any number of threads
 
 
 @pytest.mark.parametrize("name", ["tiles", "mercator", "panorama", "square", "perspective"])

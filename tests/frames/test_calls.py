@@ -5,8 +5,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
-from test_frame_networks import model_of, network_of
+from frame_samples import (
+    LAYOUTS,
+    MEAN,
+    ROUND,
+    STD,
+    in_layout,
+    model_of,
+    network_of,
+    random_frame,
+)
 
 from darswin import frames
 from darswin.deploy import camera
@@ -52,7 +60,7 @@ def test_every_layout_and_number_of_threads_gives_the_same_bits(called):
     assert not np.array_equal(called(bgr), expected)
 
 
-def test_thsupersampling_of_python_may_share_it(called):
+def test_threads_of_python_may_share_it(called):
     pictures = [frame_of(called, seed) for seed in range(6)]
     expected = [called(picture) for picture in pictures]
     with ThreadPoolExecutor(4) as pool:

@@ -160,7 +160,7 @@ def test_the_c_interface(tmp_path):
         function = getattr(library, f"darswin_{name}")
         function.restype, function.argtypes = result, arguments
     assert library.darswin_file_version() == b"2.0"
-    toml = Path(__file__).parent.parent.joinpath("pyproject.toml").read_text()
+    toml = Path(__file__).parents[2].joinpath("pyproject.toml").read_text()
     assert f'\nversion = "{library.darswin_version().decode()}"\n' in toml
 
     for model in (model_of(), model_of(features_only=True), model_of("darswin_unet_a")):
