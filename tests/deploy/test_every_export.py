@@ -97,10 +97,10 @@ PIXELS = {  # kinds of images, as they are made
 
 
 def graph_of(model, images, lens, written, path, **settings):
-    """A model in a graph, as a function of tensors by name, and the names that it takes."""
+    """A model in a graph, as a function of tensors by name, and the names that a file takes."""
     if written == "program":
         program = export_program(model, images, lens, **settings).module()
-        return lambda inputs: program(**inputs), None
+        return lambda inputs, of_lens: program(*inputs.values(), **of_lens), None
     export_onnx(model, path, images, lens, **settings)
     runtime = pytest.importorskip("onnxruntime")
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -110,8 +110,9 @@ def graph_of(model, images, lens, written, path, **settings):
         settings = {"INFERENCE_PRECISION_HINT": "f32"}
         compiled = pytest.importorskip("openvino").Core().compile_model(path, "CPU", settings)
 
-    def run(inputs):
-        arrays = {name: tensor.numpy() for name, tensor in inputs.items() if name in names}
+    def run(inputs, of_lens):
+        given = inputs | of_lens
+        arrays = {name: tensor.numpy() for name, tensor in given.items() if name in names}
         assert [*arrays] == names
         found = session.run(None, arrays) if written == "onnx" else compiled(arrays).values()
         return [torch.from_numpy(array) for array in found]
@@ -137,15 +138,15 @@ def check(kind, lens_name, written, input, fixed, path, pixels="floats"):
             if input == "tokens":
                 tokens = model.sample(images, model.prepare(lenses, (SIDE, SIDE)))
                 inputs = dict(tokens=tokens) | (inputs if model.refines_with_images else {})
-            inputs |= {} if fixed else lenses._tensors()
-            found = run(inputs)
+            of_lens = {} if fixed else lenses._tensors()
+            found = run(inputs, of_lens)
         expected, found = (
             [x] if isinstance(x, torch.Tensor) else list(x) for x in (expected, found)
         )
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
     if names is not None and input == "images":
         with pytest.raises(Exception, match=r"images|shape"):  # each runtime has its own error
-            run(inputs | dict(images=torch.cat((images, images), 2)))
+            run(dict(images=torch.cat((images, images), 2)), of_lens)
 
 
 @pytest.mark.parametrize("kind", slow_but(KINDS, *FAST))

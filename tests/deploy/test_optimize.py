@@ -10,13 +10,37 @@ import pytest
 import torch
 from helpers import network, product, relative_error
 
-from darswin import create_model, optimize
+from darswin import create_model, list_models, optimize
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import Spherical, cat
 from darswin.models.base import Model
 from darswin.views import make_view
 
 LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
+NANOS = [name for name in list_models() if name.endswith("nano")]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("name", "task"), [*((name, None) for name in NANOS), ("darswin_unet_a_nano", "distance"),
+                       ("swin_unet_nano perspective", "distance")],
+)  # fmt: skip
+def test_half_precision_is_as_exact_as_that_of_torch(name, task):
+    model = network(name, **(dict(task=task) if task else {}))
+    images = torch.randn(2, 3, *(model.image_size or (64, 64)))
+    lenses = Spherical.from_fov([0.2, 0.9], 2.6, images.shape[2] / 2)
+    expected = model(images, lenses)
+    with torch.autocast("cpu", torch.bfloat16):
+        usual = model(images, lenses)
+    half = optimize(model, torch.bfloat16)(images, lenses)
+    assert half.dtype == (torch.float32 if task else torch.bfloat16)
+
+    def error(found):
+        if task:  # the network gives logarithms; 0 m is no distance
+            return relative_error(*((x[expected > 0] + 1e-9).log() for x in (found, expected)))
+        return relative_error(found, expected)
+
+    assert error(half) < 2 * error(usual) < 0.1
 
 
 @torch.no_grad()
