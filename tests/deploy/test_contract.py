@@ -203,6 +203,8 @@ def check_samples(model, images, lenses):
 
 def check_optimized(model, images, lenses):
     expected, fast = model(images, lenses), optimize(model)
+    assert isinstance(fast, type(model)) and not isinstance(model, type(fast))
+    assert fast.pretrained_cfg == model.pretrained_cfg and not fast.training
     assert_close(fast(images, lenses), expected)
     prepared = fast.prepare(lenses, size_of(model))
     assert_close(fast.run(images, prepared), fast(images, lenses), 0)
@@ -333,17 +335,17 @@ class Computations(TorchDispatchMode):
         return result
 
 
+ASLEEP = ("darswin_a_nano", "darswin_unet_ra_nano", "conv_unet_nano", "swin_nano")
+LARGER = [name for name in list_models() if name.startswith("darswin") and name not in ASLEEP]
+
+
 @pytest.mark.unsanitized
 @torch.inference_mode()
-@pytest.mark.parametrize(
-    "name",
-    slow_but([name for name in list_models() if name.startswith("darswin")],
-             "darswin_a_nano", "darswin_unet_ra_nano"),
-)  # fmt: skip
+@pytest.mark.parametrize("name", slow_but([*ASLEEP, *LARGER], *ASLEEP))
 def test_an_optimized_model_leaves_the_threads_of_torch_asleep(name):
     # They stay awake for milliseconds after each operator, and would compete with our threads.
-    model, images = create_model(name, num_classes=5).eval(), torch.rand(1, 3, 70, 80)
-    fast = optimize(model, lens=ROUND)
+    model = create_model(name, num_classes=5).eval()
+    fast, images = optimize(model, lens=ROUND), torch.rand(1, 3, *size_of(model))
     fast(images)  # prepares the lens
     with Computations() as computed:
         fast(images)

@@ -9,7 +9,7 @@ import zipfile
 
 import pytest
 import torch
-from helpers import create
+from helpers import create, refused
 from lens_examples import example
 
 from darswin import create_model
@@ -223,8 +223,7 @@ def test_errors():
         export_program(model, images, lens, input="logits")
     with pytest.raises(TypeError, match="needs a model of darswin, got Identity"):
         export_program(torch.nn.Identity().eval(), images, input="tokens")
-    with pytest.raises(ValueError, match="model must be in eval mode"):
-        export_program(model.train(), images, lens)
+    refused("model must be in eval mode", export_program, model.train(), images, lens)
 
 
 def test_equal_nodes_are_joined_unless_one_is_changed_in_place():
