@@ -88,10 +88,7 @@ OPTIONS = [
     ("darswin_a", dict(sample_spacing="radius")),
     ("darswin_a", dict(spacing="radius")),
     ("darswin_a", dict(spacing="tan", placement="edges")),
-    ("darswin_a", dict(spacing="g", num_classes=0)),
-    ("darswin_a", dict(mlp_ratio=1.0, drop_path_rate=0.5)),
-    ("darswin_a", dict(window=(1, 8))),
-    ("darswin_a", dict(depths=(2,), num_heads=(2,))),
+    ("darswin_a", dict(spacing="g", window=(1, 8))),
     ("swin", dict(image_size=(16, 32), window=(2, 4))),
     ("dat", dict(image_size=(16, 32), blocks=("S", "LS", "D"), groups=(1, 1, 4))),
 ]
