@@ -4,6 +4,7 @@ A table of models × lenses × ways to run them: sampled elsewhere, optimized, s
 file without torch, in 8 bits.
 """
 
+import copy
 import json
 import math
 
@@ -16,7 +17,6 @@ from frame_samples import (
     STD,
     model_of,
     network_of,
-    quantized_of,
     random_frame,
     size_of,
 )
@@ -290,29 +290,54 @@ def test_with_any_options_it_trains_agrees_with_the_reference_and_has_8_bits(cas
         assert max(map(relative_error, fast, expected)) < 0.05
 
 
+IN_8_BITS = [
+    *((name, {}) for name in CLASSIFIERS),
+    *((name, dict(rings=8, sectors=16)) for name in ("darswin_unet_a", "darswin_unet_ra")),
+    ("swin_unet", dict(image_size=32)),
+    ("swin_unet", dict(image_size=32, view="square")),
+    ("swin", dict(view="perspective")),
+    ("darswin_a", dict(features_only=True)),
+    ("adapter", dict(network="swin", view="mercator")),
+]
+
+
 @torch.no_grad()
-@pytest.mark.parametrize(
-    ("family", "view"),
-    [*((name, None) for name in [*CLASSIFIERS, *UNETS, "maps"]), ("swin", "mercator")], ids=str,
-)  # fmt: skip
-def test_so_it_does_in_8_bits(family, view, tmp_path):
-    network = model_of(features_only=True) if family == "maps" else model_of(family)
-    model, whole = quantized_of(network), network
-    if view is not None:
-        model, whole = (
-            LensAdapter(one, view=make_view(view, 32, mean=MEAN, std=STD)).eval()
-            for one in (model, whole)
-        )
-    (image,) = images_of(model, count=1)
-    expected = finished(whole, whole(image[None], ROUND))
-    direct = optimize(model, torch.int8)
-    polar = "darswin" in family or family == "maps"
-    found = [finished(model, direct(image[None], ROUND)), by_file(model, ROUND, image, tmp_path)]
+@pytest.mark.parametrize("case", IN_8_BITS, ids=str)
+def test_so_it_does_in_8_bits(case, tmp_path):
+    family, options = case
+    model = made(family, **options)
+    images, lenses = (
+        images_of(model, count=8),
+        Equidistant.from_fov(torch.linspace(2.2, 2.9, 8), 30),
+    )
+    seen = model.sample(images, model.prepare(lenses, size_of(model)))
+    batches = [(images, lenses) if family != "adapter" else (seen, lenses)]
+    quantized, whole = copy.deepcopy(model), adapted(model)
+    of_8_bits = quantize_model(whole, batches, tolerance=math.inf)
+    if family == "adapter":
+        quantized.network = of_8_bits
+    else:
+        quantized = of_8_bits
+    layers = quantized_layers(of_8_bits)
+    assert len(layers) >= 8 and not quantized_layers(whole)
+    assert all(of_8_bits.get_submodule(name).weight.dtype == torch.int8 for name in layers)
+
+    def flat(out):
+        return torch.cat([one.flatten(1) for one in maps_of(out)], 1)
+
+    want, got = flat(model(images, lenses)), flat(quantized(images, lenses))
+    assert 0 < relative_error(got, want) < 0.15
+    fast = optimize(quantized, torch.int8)
+    # A rounding in float32 may move an activation by one step, and the layers after it let the
+    # difference grow, up to the error of 8 bits itself. An image without such a step is equal.
+    errors = (flat(fast(images, lenses)) - got).norm(dim=1) / got.norm(dim=1)
+    assert errors.min() < 1e-5 and errors.max() < relative_error(got, want)
+    fixed, expected = optimize(quantized, torch.int8, lens=lenses[0]), fast(images[:1], lenses[:1])
+    assert_close(fixed(images[:1]), expected, 0)
     # A view is sampled by another operator: a rounding may fall to the other side.
-    assert_close(found[1], found[0], 1e-5 if polar else 0.05)
-    for result in found:
-        for one, other in zip(maps_of(result), maps_of(expected), strict=True):
-            assert 1e-5 < (one - other).abs().max() / other.abs().max() < 0.5
+    near = 1e-5 if "darswin" in family else 0.05
+    of_file = by_file(quantized, lenses[0], images[0], tmp_path)
+    assert_close(of_file, finished(model, expected), near)
 
 
 class Computations(TorchDispatchMode):
