@@ -20,7 +20,7 @@ from frame_samples import (
     random_frame,
     size_of,
 )
-from helpers import network, product, relative_error, slow_but
+from helpers import network, products, relative_error, slow, slow_but
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -246,11 +246,20 @@ def check(case, lenses, channels, folder):
         assert_close(by_file(model, lenses[0], images[0], folder), expected)
 
 
+def rows(shift, *marks):
+    """Each network with one of the lenses."""
+    for k, case in enumerate(CASES):
+        yield pytest.param(case, [*LENSES][(k + shift) % len(LENSES)], marks=marks)
+
+
 # Under the sanitizers, each network and each lens once.
+unsanitized = pytest.mark.unsanitized
 ROWS = [
-    pytest.param(*row.values, marks=[*row.marks, *[pytest.mark.unsanitized for _ in row.marks]])
-    for row in product(CASES, LENSES)
-] + [pytest.param(case, "round", marks=pytest.mark.unsanitized) for case in OPTIONS + UNUSUAL_SIZES]
+    *rows(0),
+    *rows(1, slow, unsanitized),
+    *rows(2, slow, products, unsanitized),
+    *(pytest.param(case, "round", marks=unsanitized) for case in OPTIONS + UNUSUAL_SIZES),
+]
 
 
 @pytest.mark.parametrize(("case", "lens"), ROWS, ids=str)

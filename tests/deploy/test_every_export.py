@@ -143,7 +143,9 @@ def check(kind, lens_name, written, input, fixed, path, pixels="floats"):
         expected, found = (
             [x] if isinstance(x, torch.Tensor) else list(x) for x in (expected, found)
         )
-        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+        # Newton's method in the plane ends at another rounding.
+        rtol, atol = (1e-3, 1e-4) if "general" in lens_name else (1e-4, 1e-5)
+        torch.testing.assert_close(found, expected, rtol=rtol, atol=atol)
     if names is not None and input == "images":
         with pytest.raises(Exception, match=r"images|shape"):  # each runtime has its own error
             run(dict(images=torch.cat((images, images), 2)), of_lens)
