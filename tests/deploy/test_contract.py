@@ -315,10 +315,8 @@ IN_8_BITS = [
 def test_so_it_does_in_8_bits(case, tmp_path):
     family, options = case
     model = made(family, **options)
-    images, lenses = (
-        images_of(model, count=8),
-        Equidistant.from_fov(torch.linspace(2.2, 2.9, 8), 30),
-    )
+    images = images_of(model, count=8)
+    lenses = Equidistant.from_fov(torch.linspace(2.2, 2.9, 8), 30.0)
     seen = model.sample(images, model.prepare(lenses, size_of(model)))
     batches = [(images, lenses) if family != "adapter" else (seen, lenses)]
     quantized, whole = copy.deepcopy(model), adapted(model)
