@@ -34,7 +34,7 @@ PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocess
 # the kernels, which differ from tier to tier.
 KERNELS := $(addprefix $(ROOT)/tests/,$(foreach name,blocks contract gathers inference polar_sample \
   polar_to_image properties quantized_blocks window_attention,ops/test_$(name).py) \
-  frames/test_frames.py deploy/test_contract.py)
+  frames/test_plans.py deploy/test_contract.py)
 COMPILED := $(addprefix $(ROOT)/tests/,ops frames deploy/test_contract.py deploy/test_record.py)
 TIERS = $$($(ROOT)/$(BIN)/python -c 'from darswin.ops import _module; print(*reversed(_module.tiers()))')
 
@@ -77,7 +77,8 @@ $(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
 test-lowest: build $(LOWEST)/installed  ## test the commands, files, pictures and ONNX with the oldest supported libraries
 	PYTHONPATH=$(ROOT) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
 	  tests/cli tests/viz \
-	  tests/deploy/test_export.py -k "not program and not package"
+	  tests/deploy/test_export.py tests/deploy/test_every_export.py \
+	  -k "not program and not package and not every_lens and not openvino"
 
 test-isa: build  ## test the operators on every instruction-set tier of this machine
 	@set -e; for tier in $(TIERS); do \
@@ -125,7 +126,7 @@ FUZZ := $(ROOT)/$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=
 fuzz: sanitized  ## call the operators with hostile arguments, read 100,000 wrong calibrations and 250,000 wrong files of cameras (45 minutes)
 	$(FUZZ) tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
 	cd $(SANITIZED); $(SANITIZER) $(FUZZ) -c $(ROOT)/pyproject.toml --rootdir $(ROOT) \
-	  $(ROOT)/tests/test_frame_files.py
+	  $(ROOT)/tests/frames/test_tensor_file.py
 
 kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py

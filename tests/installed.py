@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests"
-COMPILED = [TESTS / "ops", TESTS / "test_frames.py"]
+COMPILED = [TESTS / "ops", TESTS / "frames" / "test_plans.py"]
 PURE = [
     "-m",
     "not slow and not compiled",

@@ -10,7 +10,7 @@ import types
 
 import pytest
 import torch
-from helpers import fixture
+from helpers import fixture, refused
 from safetensors import safe_open
 from safetensors.torch import load_file
 
@@ -104,8 +104,7 @@ def test_a_hostile_checkpoint_is_refused(entry, zipped, tmp_path):
         hostile = {"model": {"a": torch.zeros(3)}, entry: Hostile(function, *arguments)}
         torch.save(hostile, source, _use_new_zipfile_serialization=zipped)
         for read in (read_state, load_official, lambda path: convert_checkpoint(path, target)):
-            with pytest.raises(ValueError, match=f"is refused, .* it refers to {name}, which"):
-                read(source)
+            refused(f"is refused, .* it refers to {name}, which", read, source)
         assert list(tmp_path.iterdir()) == [source]
         torch.load(source, weights_only=False)  # without the refusal, the code runs
         executed.unlink()
@@ -115,14 +114,12 @@ def test_files_that_are_no_checkpoints(tmp_path):
     source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
     for content in ({"epoch": 3}, [torch.zeros(2)], {"model": [torch.zeros(2)]}):
         torch.save(content, source)
-        with pytest.raises(ValueError, match="has no state dict"):
-            convert_checkpoint(source, target)
+        refused("has no state dict", convert_checkpoint, source, target)
         assert not target.exists()
     for content in (b"", b"no checkpoint", b"PK\3\4" + bytes(100), b"\x80\2R."):
         for path, message in ((source, "as a checkpoint"), (target, "as safetensors")):
             path.write_bytes(content)
-            with pytest.raises(ValueError, match=f"{path.name} cannot be read {message}"):
-                read_state(path)
+            refused(f"{path.name} cannot be read {message}", read_state, path)
     for name in ("another.pth", "another.safetensors"):
         with pytest.raises(FileNotFoundError):
             read_state(tmp_path / name)

@@ -4,8 +4,8 @@ from functools import partial
 
 import pytest
 import torch
-from frames import CALIBRATIONS, WOODSCAPE
 from helpers import refused
+from lens_pictures import CALIBRATIONS, WOODSCAPE
 
 from darswin.data import Calibrations
 from darswin.lens import Tabulated, from_dict, load, load_all

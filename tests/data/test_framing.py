@@ -4,9 +4,9 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from frames import WOODSCAPE, at_size, blob, centroid
 from helpers import refused
 from hypothesis import given
+from lens_pictures import WOODSCAPE, at_size, blob, centroid
 
 from darswin.data import IGNORE, FullSize, fitted
 from darswin.data.framing import cut_off

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from helpers import refused, slow_but
+from lens_pictures import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from PIL import ExifTags, Image
 from scenes import write_plain
 from torch.utils.data import DataLoader

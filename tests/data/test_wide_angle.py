@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import blob, centroid, warped
 from helpers import refused
+from lens_pictures import blob, centroid, warped
 
 from darswin.data import PolynomialLenses, RandomTurns, SphericalLenses, WideAngle
 from darswin.data.lens_distributions import LEVELS, parse_lenses, parse_sweep

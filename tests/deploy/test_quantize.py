@@ -1,4 +1,5 @@
-"""Models with 8 bits: what they lose, what stays in float32, and that the fast one is the same."""
+"""Models with 8 bits: what they lose and what stays in float32. test_contract.py has the table of
+models whose fast ones and files compute the same."""
 
 import math
 import os
@@ -7,12 +8,14 @@ import sys
 
 import pytest
 import torch
-from helpers import create, relative_error
+from frame_samples import model_of
+from helpers import refused, relative_error
 from torch import nn
 
 from darswin import optimize
 from darswin.deploy import packed
 from darswin.deploy import quantize as module
+from darswin.deploy.export import export_onnx, export_package
 from darswin.deploy.quantize import quantize_model, sensitivities
 from darswin.layers.linear import Linear, onednn_lack
 from darswin.layers.quantized import (
@@ -29,56 +32,16 @@ from darswin.models import ModelCard, load_model, save_model
 from darswin.ops import _module
 
 HAS_VNNI = _module.byte_products() != "pairs"  # or dot products of ARM
-MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_nano perspective", "dat_nano",
-          "darswin_unet_a_nano", "swin_unet_nano square"]  # fmt: skip
 
 
-def network(name="darswin_a_nano", **options):
-    """A model whose every parameter counts, and whose signal neither grows nor dies."""
-    torch.manual_seed(0)
-    if name.startswith("swin_unet"):
-        options["image_size"] = 32
-    if name.startswith("darswin_unet"):
-        options |= dict(rings=8, sectors=16)
-    model = create(name, **(dict(num_classes=10) | options)).eval()
-    for layer in model.modules():
-        if isinstance(layer, nn.Linear):
-            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
-            if layer.bias is not None:
-                nn.init.normal_(layer.bias, std=0.1)
-    return model
-
-
-def flat(out):
-    """A result, or the maps of a model of features, as (B, numbers)."""
-    return torch.cat([one.flatten(1) for one in (out if isinstance(out, list) else [out])], 1)
+def network(family="darswin_a", **options):
+    small = dict(rings=8, sectors=16) if family == "darswin_unet_a" else {}
+    return model_of(family, **small, **options)
 
 
 def batch(count=4, size=32):
     lens = Spherical.from_fov(torch.rand(count), math.radians(160), size / 2)
     return torch.randn(count, 3, size, size), lens
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("name", [*MODELS, "features"])
-def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
-    features = dict(features_only=True, num_classes=0)
-    model = network(**features) if name == "features" else network(name)
-    seen = batch()
-    quantized = quantize_model(model, [seen], tolerance=math.inf)
-    layers = quantized_layers(quantized)
-    assert len(layers) >= 8 and not quantized_layers(model)
-    assert all(quantized.get_submodule(name).weight.dtype == torch.int8 for name in layers)
-    images, lens = batch(8)
-    want, got = flat(model(images, lens)), flat(quantized(images, lens))
-    assert 0 < relative_error(got, want) < 0.15
-    fast = optimize(quantized, torch.int8)
-    # A rounding in float32 may move an activation by one step, and the layers after it let the
-    # difference grow, up to the error of 8 bits itself. An image without such a step is equal.
-    errors = (flat(fast(images, lens)) - got).norm(dim=1) / got.norm(dim=1)
-    assert errors.min() < 1e-5 and errors.max() < relative_error(got, want)
-    one = optimize(quantized, torch.int8, lens=lens[:1])
-    assert torch.equal(flat(one(images[:1])), flat(fast(images[:1], lens[:1])))
 
 
 @torch.no_grad()
@@ -120,8 +83,7 @@ def test_what_disturbs_most_stays_in_float32():
     all_of_it = quantized_layers(quantize_model(model, [seen], tolerance=math.inf))
     some = quantized_layers(quantize_model(model, [seen], tolerance=1e-2))
     assert "stages.1.blocks.0.attn.qkv" in all_of_it.keys() - some.keys()
-    with pytest.raises(ValueError, match=r"exceeds the `tolerance` 0\.0"):
-        quantize_model(model, [seen], tolerance=0.0)
+    refused(r"exceeds the `tolerance` 0\.0", quantize_model, model, [seen], tolerance=0.0)
 
 
 def test_ranges_lose_least():
@@ -152,14 +114,13 @@ def test_the_model_stays_as_it_is_and_its_copy_has_no_gradients():
 def test_layers_that_cannot_go_together_are_named():
     steps = Quantization(0.05, 128)
     for name, layer, message in (
-        ("darswin_a_nano", "stages.0.blocks.0.mlp.fc1", "both products of an MLP"),
-        ("darswin_a_nano", "stages.0.blocks.0.mlp.fc2", "both products of an MLP"),
-        ("darswin_unet_a_nano", "segmentation_head.proj", "must be a linear one"),
+        ("darswin_a", "stages.0.blocks.0.mlp.fc1", "both products of an MLP"),
+        ("darswin_a", "stages.0.blocks.0.mlp.fc2", "both products of an MLP"),
+        ("darswin_unet_a", "segmentation_head.proj", "must be a linear one"),
     ):
         model = network(name)
         with_quantized_layers(model, {layer: steps})
-        with pytest.raises(ValueError, match=message):
-            optimize(model, torch.int8)
+        refused(message, optimize, model, torch.int8)
 
 
 @pytest.mark.slow
@@ -196,8 +157,7 @@ def test_saved_and_loaded(tmp_path):
     # The file alone says all of it, and a wrong name is an error.
     wrong = ModelCard("darswin_a_nano", dict(num_classes=10), quantized={"head.x": (1.0, 0)})
     save_model(tmp_path / "w.safetensors", quantized.state_dict(), wrong)
-    with pytest.raises(ValueError, match=r"no linear layer 'head\.x'"):
-        load_model(tmp_path / "w.safetensors")
+    refused(r"no linear layer 'head\.x'", load_model, tmp_path / "w.safetensors")
 
 
 @pytest.mark.slow
@@ -217,7 +177,7 @@ def test_fastest(monkeypatch):
 
 @pytest.mark.slow
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
+@pytest.mark.parametrize("name", ["darswin_a", "dat"])
 def test_the_largest_sums_do_not_overflow(name):
     """CPUs without VNNI may add the products of two bytes in 16 bits, where 2 · 255 · 127 is too
     large."""
@@ -232,9 +192,9 @@ def test_the_largest_sums_do_not_overflow(name):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_a_micro"])
-def test_every_way_of_8_bits_has_the_same_bits(name):
-    quantized, seen = quantize_model(network(name), [batch()], tolerance=math.inf), batch()
+@pytest.mark.parametrize("size", ["nano", "micro"])
+def test_every_way_of_8_bits_has_the_same_bits(size):
+    quantized, seen = quantize_model(network(size=size), [batch()], tolerance=math.inf), batch()
     fast, found = optimize(quantized, torch.int8, strict=True), []
     try:
         for way in _module.BYTE_PRODUCTS:  # those that the CPU lacks are the way before
@@ -303,16 +263,14 @@ def test_wrong_arguments():
         (model, [(seen[0][:0], seen[1])], ValueError, "have pictures, got none"),
         (model, [(images, seen[1])], ValueError, "not finite"),
     ):
-        with pytest.raises(kind, match=message):
-            quantize_model(given, batches)
+        refused(message, quantize_model, given, batches, error=kind)
     for given, dtype, batches in (
         (quantized, torch.float32, None),
         (model, torch.bfloat16, [seen]),
         (model, torch.int8, None),
         (quantized, torch.int8, [seen]),
     ):
-        with pytest.raises(ValueError, match=r"quantized? model|quantize_model"):
-            optimize(given, dtype, batches=batches)
+        refused(r"quantized? model|quantize_model", optimize, given, dtype, batches=batches)
 
 
 def may_overflow(weight):
@@ -349,18 +307,26 @@ def test_no_integer_products_of_onednn_without_vnni():
     assert run.returncode == 0, run.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("vnni_only", [False, True])
-def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
+@pytest.fixture(scope="module", params=[False, True], ids=["any CPU", "VNNI"])
+def exported(request, tmp_path_factory):
+    """A quantized model, its results for some images, its ONNX file, the inputs of the file, and
+    whether this is for CPUs with VNNI alone."""
     pytest.importorskip("onnxscript")
-    runtime = pytest.importorskip("onnxruntime")
-    onnx = pytest.importorskip("onnx")
-    from darswin.deploy.export import export_onnx
+    torch.manual_seed(0)
+    model, (images, lens) = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
+    quantized = quantize_model(model, [(images, lens)])
+    path = tmp_path_factory.mktemp("quantized") / "q.onnx"
+    export_onnx(quantized, path, images, lens, vnni_only=request.param)
+    inputs = dict(images=images, xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
+    with torch.no_grad():
+        expected = quantized(images, lens)
+    return quantized, expected, path, {k: v.numpy() for k, v in inputs.items()}, request.param
 
-    model, seen = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
-    quantized = quantize_model(model, [seen])
-    path, lens = tmp_path / "q.onnx", seen[1]
-    export_onnx(quantized, path, *seen, vnni_only=vnni_only)
+
+@pytest.mark.slow
+def test_onnx_runtime_says_the_same(exported):
+    runtime, onnx = (pytest.importorskip(name) for name in ("onnxruntime", "onnx"))
+    quantized, expected, path, inputs, vnni_only = exported
     graph = onnx.load(path).graph
     kinds = [node.op_type for node in graph.node]
     assert kinds.count("QuantizeLinear") == len(quantized_layers(quantized))
@@ -374,49 +340,33 @@ def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
             assert torch.equal(steps, quantized.get_submodule(name).weight.int())
             overflows[name] = may_overflow(weight)
     assert set(overflows.values()) == {vnni_only}
-    if vnni_only and not HAS_VNNI:
-        return
-    given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
-    (logits,) = runtime.InferenceSession(path).run(None, {k: v.numpy() for k, v in given.items()})
-    with torch.no_grad():
-        want = quantized(*seen)
-    assert (torch.from_numpy(logits).argmax(1) == want.argmax(1)).all()
-    assert relative_error(torch.from_numpy(logits), want) < 0.05
+    if HAS_VNNI or not vnni_only:
+        (logits,) = map(torch.from_numpy, runtime.InferenceSession(path).run(None, inputs))
+        assert (logits.argmax(1) == expected.argmax(1)).all()
+        assert relative_error(logits, expected) < 0.05
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vnni_only", [False, True])
-def test_openvino_multiplies_with_8_bits_in_files_for_vnni(vnni_only, tmp_path):
+def test_openvino_multiplies_with_8_bits_in_files_for_vnni(exported):
     openvino = pytest.importorskip("openvino")
+    quantized, expected, path, inputs, vnni_only = exported
     if vnni_only and not HAS_VNNI:
         pytest.skip("such a file is not for this CPU")
-    from darswin.deploy.export import export_onnx
-
-    model, seen = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
-    quantized, path, lens = quantize_model(model, [seen]), tmp_path / "q.onnx", seen[1]
-    export_onnx(quantized, path, *seen, vnni_only=vnni_only)
     settings = {"INFERENCE_PRECISION_HINT": "f32"}
     compiled = openvino.Core().compile_model(path, "CPU", settings)
     nodes = [op.get_rt_info() for op in compiled.get_runtime_model().get_ordered_ops()]
     products = [n["primitiveType"].value for n in nodes if n["layerType"].value == "FullyConnected"]
     in_8_bits = [product for product in products if product.endswith("I8")]
-    expected = len(quantized_layers(quantized)) if vnni_only else 0
-    assert len(in_8_bits) == expected
-    given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
-    logits = torch.from_numpy(compiled({k: v.numpy() for k, v in given.items()})["logits"])
-    with torch.no_grad():
-        want = quantized(*seen)
-    assert (logits - want).abs().max() < 0.05 * want.abs().max()
+    assert len(in_8_bits) == (len(quantized_layers(quantized)) if vnni_only else 0)
+    logits = torch.from_numpy(compiled(inputs)["logits"])
+    assert (logits - expected).abs().max() < 0.05 * expected.abs().max()
 
 
 @pytest.mark.slow
 def test_a_package_computes_as_the_quantized_model(tmp_path):
-    from darswin.deploy.export import export_package
-
     model, (images, lenses) = network(depths=(1,), num_heads=(1,)), batch(6)
     quantized = quantize_model(model, [(images, lenses)])
     export_package(quantized, tmp_path / "q.pt2", images, lenses[0], fixed_lens=True)
-    packed = torch._inductor.aoti_load_package(tmp_path / "q.pt2")
+    package = torch._inductor.aoti_load_package(tmp_path / "q.pt2")
     with torch.no_grad():
-        want = quantized(images, lenses[0])
-    assert relative_error(packed(images), want) < 0.01
+        assert relative_error(package(images), quantized(images, lenses[0])) < 0.01

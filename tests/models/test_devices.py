@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from helpers import create, slow_but
+from helpers import create, product
 from launches import Launches, launches
 
 from darswin import lens
@@ -39,13 +39,6 @@ MODELS = {
     "conv_unet_nano": dict(task="distance", view="mercator", size=48),
     "swin_unet_nano": dict(image_size=64, view=dict(name="equirectangular", fov=2.6)),
 }
-VIEWS = ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_nano perspective")
-CALLS = [
-    *((name, "spherical", torch.float32) for name in MODELS),
-    *((name, "spherical", torch.uint8) for name in (*VIEWS, "swin_nano")),
-    *((name, kind, torch.float32) for name in VIEWS for kind in ("curves", "tangential", "affine")),
-    ("darswin_a_nano", "of an image size", torch.float32),
-]
 
 
 def network(name, **options):
@@ -57,8 +50,7 @@ def images(dtype=torch.float32, size=64):
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "dtype"),
-    slow_but(CALLS, *CALLS[: len(MODELS)], *(call for call in CALLS if call[0] == VIEWS[0])),
+    ("name", "kind", "dtype"), product(MODELS, LENSES, [torch.float32, torch.uint8])
 )
 def test_no_model_waits_in_a_step(name, kind, dtype, monkeypatch):
     # All steps of Newton's method are alike, so three of them are enough.

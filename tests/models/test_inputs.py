@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from helpers import network, product, side_of
+from helpers import network, product, refused, side_of
 from torch import nn
 
 from darswin import PolarView, list_models, optimize
@@ -55,14 +55,13 @@ def total(out):
 # -- normalization --------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-@models
-@pytest.mark.parametrize(("mean", "std"), [(MEAN, STD), (0.4, 0.2), (0.4, STD)])
-def test_normalize_gives_what_the_model_makes_of_uint8(kind, mean, std):
-    model, frames, lens = made(kind, mean=mean, std=std)
-    m, s = torch.tensor([MEAN if mean is MEAN else [mean] * 3, STD if std is STD else [std] * 3])[
-        ..., None, None
-    ]
+@pytest.mark.parametrize(
+    ("kind", "statistics"), product(MODELS, [(MEAN, STD), (0.4, 0.2), (0.4, STD)])
+)
+def test_normalize_gives_what_the_model_makes_of_uint8(kind, statistics):
+    mean, std = statistics
+    model, frames, _ = made(kind, mean=mean, std=std)
+    m, s = (torch.tensor(x, dtype=torch.float64).expand(3).view(3, 1, 1) for x in statistics)
     expected = (frames.double() / 255 - m) / s
     last = frames.permute(0, 2, 3, 1).contiguous()
     for images in (frames, last, frames / 255, frames.double() / 255, (frames / 255).bfloat16()):
@@ -70,26 +69,22 @@ def test_normalize_gives_what_the_model_makes_of_uint8(kind, mean, std):
         assert got.dtype == torch.float32 and got.shape == frames.shape
         coarse = 0.02 if images.dtype == torch.bfloat16 else 1e-5
         torch.testing.assert_close(got.double(), expected, rtol=0, atol=coarse)
-    results = [model(images, lens) for images in (frames, model.normalize(frames / 255))]
-    assert total(results[0]) == pytest.approx(total(results[1]).item(), rel=1e-3, abs=1e-3)
     if kind != "adapter":
         assert model.to(torch.bfloat16).normalize(frames).dtype == torch.bfloat16
 
 
 def test_normalize_refuses_what_it_cannot_take():
     model, frames, _ = made("darswin_a_nano")
-    with pytest.raises(
-        ValueError, match=r"in \[0, 1\], got values up to 2\d\d: divide them by 255"
-    ):
-        model.normalize(frames.float())
-    with pytest.raises(TypeError, match=r"floating point or uint8, got torch\.int64"):
-        model.normalize(frames.long())
-    with pytest.raises(TypeError, match="images must be a tensor, got ndarray"):
-        model.normalize(frames.numpy())
-    with pytest.raises(ValueError, match="must have 3 channels, got 2"):
-        model.normalize(torch.rand(2, 2, 8, 8))
-    with pytest.raises(ValueError, match="normalize needs a model with mean and std"):
-        adapter().normalize(torch.rand(2, 3, 8, 8))
+    refused(
+        r"in \[0, 1\], got values up to 2\d\d: divide them by 255", model.normalize, frames.float()
+    )
+    integers = r"floating point or uint8, got torch\.int64"
+    refused(integers, model.normalize, frames.long(), error=TypeError)
+    array = "images must be a tensor, got ndarray"
+    refused(array, model.normalize, frames.numpy(), error=TypeError)
+    refused("must have 3 channels, got 2", model.normalize, torch.rand(2, 2, 8, 8))
+    unknown = "normalize needs a model with mean and std"
+    refused(unknown, adapter().normalize, torch.rand(2, 3, 8, 8))
     assert model.normalize(torch.rand(0, 3, 8, 8)).shape == (0, 3, 8, 8)
     image = torch.rand(1, 3, 8, 8, requires_grad=True)
     model.normalize(image).sum().backward()
@@ -141,9 +136,8 @@ def test_graphs_and_gradients_do_not_see_the_look():
     assert not told(lambda: compiled(pixels, lens))
     assert model._looks == 3
     assert not told(lambda: export_program(model, pixels, lens))
-    torch.jit.trace(
-        lambda x: model.normalize(x), pixels, check_trace=False
-    )  # in eager mode, these values are an error
+    # In eager mode, these values are an error.
+    torch.jit.trace(lambda x: model.normalize(x), pixels, check_trace=False)
     assert model._looks == 3
     grown = pixels.requires_grad_()
     assert len(told(lambda: total(model(grown, lens)).backward())) == 1
@@ -166,29 +160,21 @@ def test_channels_come_first_and_a_batch_before_them(kind):
         (channels_first[0], r"for one image, pass images\[None\]$"),
         (channels_first[0, 0], r"for one gray image, pass images\[None, None\]$"),
     ):
-        with pytest.raises(ValueError, match=rf"must have shape \(B, C, H, W\), got .*{advice}"):
-            model(images, lens)
-        with pytest.raises(ValueError, match=advice):
-            model.run(images, None)
+        refused(rf"must have shape \(B, C, H, W\), got .*{advice}", model, images, lens)
+        refused(advice, model.run, images, None)
     if kind != "adapter":  # it knows its channels neither
-        with pytest.raises(ValueError, match=r"come first: pass images\.permute\(0, 3, 1, 2\)"):
-            model(channels_last, lens)
+        refused(r"come first: pass images\.permute\(0, 3, 1, 2\)", model, channels_last, lens)
         for frame in (frames[0], frames[0].permute(1, 2, 0)):
-            with pytest.raises(ValueError, match=r"for one image, pass images\[None\]$"):
-                model(frame, lens)
+            refused(r"for one image, pass images\[None\]$", model, frame, lens)
 
 
 @pytest.mark.parametrize("kind", ["layer", "adapter"])
 def test_what_does_not_know_its_channels_finds_them_by_the_lens(kind):
     layer = adapter() if kind == "adapter" else PolarView(4, 8, (2, 2))
     images, lens = torch.rand(2, 24, 32, 3), Spherical(0.5, 9.0, 1.2, image_size=(24, 32))
-    with pytest.raises(
-        ValueError, match=r"of \(32, 3\); the channels come first: pass images\.perm"
-    ):
-        layer(images, lens)
+    refused(r"of \(32, 3\); the channels come first: pass images\.perm", layer, images, lens)
     layer(images.permute(0, 3, 1, 2), lens)
-    with pytest.raises(ValueError, match=r"resized, use lens\.resized\(\(12, 16\)\)"):
-        layer(torch.rand(2, 3, 12, 16), lens)
+    refused(r"resized, use lens\.resized\(\(12, 16\)\)", layer, torch.rand(2, 3, 12, 16), lens)
 
 
 def test_operators_give_the_same_advice():
@@ -219,16 +205,11 @@ def test_images_are_on_the_device_of_the_model(kind):
     for there, here in (("meta", "cpu"), ("cpu", "meta")):
         model = model.to_empty(device=there)
         for images in (frames.to(here), (frames / 255).to(here)):
-            with pytest.raises(
-                ValueError, match=message.format("images", there, here, "images", there)
-            ):
-                model(images, lens)
-            with pytest.raises(ValueError, match="images must be on the device"):
-                model.run(images, prepared)
-            with pytest.raises(ValueError, match="images must be on the device"):
-                model.normalize(images)
-        with pytest.raises(ValueError, match="must be on the device"):
-            model.run_sampled(sampled.to(here), prepared, frames.to(there))
+            refused(message.format("images", there, here, "images", there), model, images, lens)
+            refused("images must be on the device", model.run, images, prepared)
+            refused("images must be on the device", model.normalize, images)
+        given = sampled.to(here), prepared, frames.to(there)
+        refused("must be on the device", model.run_sampled, *given)
 
 
 # -- adapters -------------------------------------------------------------------------------------
@@ -262,8 +243,7 @@ def test_wrong_statistics_of_an_adapter():
         (dict(mean=0.5, std=0.0), "std must be positive"),
         (dict(output="image"), "output must be 'pixels' or 'view', got 'image'"),
     ):
-        with pytest.raises(ValueError, match=message):
-            adapter(**options)
+        refused(message, adapter, **options)
     gray = LensAdapter(nn.Identity(), 8, mean=MEAN, std=STD)
     with pytest.raises(ValueError, match=r"mean must be one number or one per channel \(1\)"):
         gray(torch.zeros(1, 1, 8, 8, dtype=torch.uint8), Spherical(0.5, 4.0, 1.2))

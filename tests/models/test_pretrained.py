@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from frames import at_size
+from helpers import refused
+from lens_pictures import at_size
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
@@ -103,13 +104,10 @@ def test_what_comes_with_a_model():
         assert config["num_classes"] == len(card.classes)
         count = sum(parameter.numel() for parameter in model.parameters())
         assert f"{count:,} parameters" in pretrained_file(name, "md").read_text()
-    with pytest.raises(ValueError, match="no model 'letters' comes with darswin; the models are d"):
-        pretrained_file("letters")
+    refused("no model 'letters' comes with darswin; the models are d", pretrained_file, "letters")
     missing = "there is no file letters, and no model 'letters' comes with darswin; the models are"
-    with pytest.raises(FileNotFoundError, match=missing):
-        load_model("letters")
-    with pytest.raises(FileNotFoundError, match=r"letters\.safetensors"):
-        load_model("letters.safetensors")
+    refused(missing, load_model, "letters", error=FileNotFoundError)
+    refused(r"letters\.safetensors", load_model, "letters.safetensors", error=FileNotFoundError)
 
 
 NO_WEIGHTS = "no trained darswin_a_small comes with darswin; load_model and .* know digits, and"
@@ -129,8 +127,7 @@ NO_WEIGHTS = "no trained darswin_a_small comes with darswin; load_model and .* k
     ],
 )
 def test_who_asks_for_weights_learns_which_there_are(make, message):
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        make()
+    refused(message, make, error=(ValueError, FileNotFoundError))
 
 
 def test_pretrained_may_be_false():

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from frames import write_frames
+from lens_pictures import write_frames
 from runs import DIGITS, PIXELS, checkpoint, fit, killed_fit
 from scenes import write_plain
 

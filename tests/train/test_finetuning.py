@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from frames import WOODSCAPE, write_frames
 from helpers import refused
+from lens_pictures import WOODSCAPE, write_frames
 from runs import DIGITS, QUIET, assert_same, checkpoint, error, fit, killed_fit, test
 from safetensors.torch import load_file
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from frames import WOODSCAPE
 from helpers import refused
+from lens_pictures import WOODSCAPE
 from scenes import write_plain
 
 from darswin.data import IGNORE

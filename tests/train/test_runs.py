@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from frames import WOODSCAPE
 from helpers import refused, slow_but
+from lens_pictures import WOODSCAPE
 from lightning.pytorch.strategies import Strategy
 from runs import (
     DIGITS,

@@ -8,8 +8,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from frames import WOODSCAPE, write_frames
 from helpers import refused
+from lens_pictures import WOODSCAPE, write_frames
 from runs import DIGITS, error
 from scenes import write, write_plain
 from scipy.stats import binomtest

@@ -14,7 +14,7 @@ from darswin.lens import Lens, Perspective, load
 from darswin.utils.tasks import Fit
 from darswin.views import CameraView
 
-CALIBRATIONS = Path(__file__).parent / "lens" / "files"
+CALIBRATIONS = Path(__file__).parents[1] / "lens" / "files"
 WOODSCAPE = CALIBRATIONS / "woodscape.json"
 FOV = 2.8  # rad, that a digit's width spans
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import slow_but
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -339,8 +340,14 @@ def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
             assert ((mask > 0.5) == (known & inside if is_cut else known)).all()
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float16])
-@pytest.mark.parametrize("form", ALL)
+@pytest.mark.parametrize(
+    ("form", "dtype"),
+    slow_but(
+        itertools.product(ALL, [np.float32, np.float16]),
+        *((form, np.float32) for form in ALL),
+        *((form, np.float16) for form in [*ALL][::5]),
+    ),
+)
 def test_every_form_is_found(tmp_path, form, dtype):
     near = {} if dtype == np.float32 else dict(px=0.3, in_scores=2e-3)
     for batch in (1,) if form in FLAT else (1, "B"):

@@ -8,7 +8,7 @@ import torch
 
 from darswin import create_model, lens
 
-MINIMAL = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "minimal.py"))
+MINIMAL = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "minimal.py"))
 MICRO = dict(dim=32, depths=(2, 2, 4, 2), heads=(1, 2, 4, 8), samples=6)
 NANO = dict(dim=24, depths=(1, 2, 1), heads=(1, 2, 4), rings=8, sectors=32, samples=4)
 

@@ -78,11 +78,14 @@ def model_of(family="darswin_a", channels=3, *, size="nano", **options):
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+    for name, parameter in model.named_parameters():
+        if parameter.dim() == 1 or ".position_bias." in name:  # norms too
+            parameter.data += 0.1 * torch.randn_like(parameter)
     return model
 
 
 def size_of(model):
-    return model.image_size or (70, 80)
+    return model.image_size or ((64, 64) if model.square_images else (70, 80))
 
 
 def quantized_of(model):

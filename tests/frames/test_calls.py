@@ -5,8 +5,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
-from test_frame_networks import model_of, network_of
+from frame_samples import (
+    LAYOUTS,
+    MEAN,
+    ROUND,
+    STD,
+    in_layout,
+    model_of,
+    network_of,
+    random_frame,
+)
+from helpers import refused
 
 from darswin import frames
 from darswin.deploy import camera
@@ -52,7 +61,7 @@ def test_every_layout_and_number_of_threads_gives_the_same_bits(called):
     assert not np.array_equal(called(bgr), expected)
 
 
-def test_thsupersampling_of_python_may_share_it(called):
+def test_threads_of_python_may_share_it(called):
     pictures = [frame_of(called, seed) for seed in range(6)]
     expected = [called(picture) for picture in pictures]
     with ThreadPoolExecutor(4) as pool:
@@ -72,17 +81,14 @@ def test_out_takes_the_result(called):
     read_only.flags.writeable = False
     for wrong in (expected.astype(np.float64), expected[:-1], read_only, np.repeat(out, 2)[::2],
                   np.empty((*expected.shape, 2), np.float32)[..., 0], expected[None]):  # fmt: skip
-        with pytest.raises(ValueError, match=rf"out must be .* of float32 with shape \({shape}\)"):
-            called(frame, wrong)
+        refused(rf"out must be .* of float32 with shape \({shape}\)", called, frame, wrong)
     for wrong in ([out], 1, "out"):
         name = type(wrong).__name__
-        with pytest.raises(TypeError, match=f"^out must be a NumPy array, got .*{name}"):
-            called(frame, wrong)
+        refused(f"^out must be a NumPy array, got .*{name}", called, frame, wrong, error=TypeError)
     memory = np.zeros(frame.nbytes - 4 + out.nbytes, np.uint8)
     inside = memory[: frame.nbytes].reshape(frame.shape)
     end = memory[frame.nbytes - 4 :].view(np.float32).reshape(out.shape)
-    with pytest.raises(ValueError, match="out must not share memory with the frame"):
-        called(inside, end)
+    refused("out must not share memory with the frame", called, inside, end)
 
 
 @pytest.mark.parametrize("name", ["sampler", "darswin_a"])
@@ -101,5 +107,4 @@ def test_wrong_frames_are_explained(name, tmp_path):
         with pytest.raises(error, match=words) as caught:
             called(frame)
         assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="threads must be at least 1"):
-        called(random_frame(70, 80, 3), threads=0)
+    refused("threads must be at least 1", called, random_frame(70, 80, 3), threads=0)

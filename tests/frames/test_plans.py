@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from frame_samples import LAYOUTS, MEAN, ROUND, STD, bilinear, in_layout, random_frame
-from helpers import CAMERAS
+from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, random_frame
+from helpers import CAMERAS, refused
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -125,8 +125,7 @@ def test_a_file_holds_the_plan(tmp_path):
         assert type(found) is type(value)
         np.testing.assert_array_equal(found, value)
     np.testing.assert_array_equal(frames.Sampler(path)(frame), frames.Sampler(plan)(frame))
-    with pytest.raises(ValueError, match=r"must end in \.safetensors"):
-        plan.save(tmp_path / "camera.npz")
+    refused(r"must end in \.safetensors", plan.save, tmp_path / "camera.npz")
 
 
 @pytest.mark.parametrize("at", [0, 4, 8996, 9500])
@@ -144,16 +143,14 @@ def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
         np.testing.assert_array_equal(sampler(frame, out), expected)
     else:
         before = memory.copy()
-        with pytest.raises(ValueError, match="out must not share memory with the frame"):
-            sampler(frame, out, threads=2)
+        refused("out must not share memory with the frame", sampler, frame, out, threads=2)
         np.testing.assert_array_equal(memory, before)
 
 
 def test_a_view_cannot_be_written_over_its_own_frame():
     plan = camera.plan(make_view("perspective", (50, 60), fov=1.0), ROUND, (50, 60), output="uint8")
     sampler, frame = frames.Sampler(plan), random_frame(50, 60, 3)
-    with pytest.raises(ValueError, match="out must not share memory with the frame"):
-        sampler(frame, out=frame)
+    refused("out must not share memory with the frame", sampler, frame, out=frame)
     sampler(frame, out=frame.copy())
 
 
@@ -220,22 +217,6 @@ def test_wrong_plans_are_explained(changes, error, words):
 PLAN = camera.plan(layer(), ROUND, (50, 60))
 
 
-@given(st.integers(0, 2**31), st.sampled_from(LAYOUTS))
-def test_plans_with_any_places_stay_inside_the_frame(seed, layout):
-    rng = np.random.default_rng(seed)
-    shape = PLAN.right.shape
-    columns, rows = rng.integers(-(2**15), 2**15, (2, *shape)).astype(np.int16)
-    near = rng.random(shape) < 0.7
-    columns, rows = np.where(near, columns % 64 - 2, columns), np.where(near, rows % 54 - 2, rows)
-    right, lower = rng.random((2, *shape), np.float32)
-    plan = replace(PLAN, columns=columns.astype(np.int16), rows=rows.astype(np.int16),
-                   right=right, lower=lower, mean=(0.0,), std=(1 / 255,))  # fmt: skip
-    frame = random_frame(50, 60, 3, seed=seed)
-    found = frames.Sampler(plan)(in_layout(frame, layout))
-    expected = bilinear(frame, columns + right.astype(np.float64), rows + lower)
-    np.testing.assert_allclose(found, expected.reshape(found.shape), atol=1e-2)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -256,7 +237,7 @@ def test_plans_with_any_places_stay_inside_the_frame(seed, layout):
     ids=str,
 )
 def test_plans_that_do_not_fit_together_are_refused(changes, tmp_path):
-    with pytest.raises(ValueError, match="plan"):
+    with pytest.raises(ValueError, match="plan"):  # by the plan itself, or by its sampler
         frames.Sampler(replace(PLAN, **changes))
 
 
@@ -314,7 +295,6 @@ def test_what_cannot_be_read_is_refused():
     for wrong in ((picture[0], x, x, 1), (picture, x[0], x[0], 1), (picture, x, x, 3),
                   (picture, x, x, 0), (picture, x, x[:1], 1),
                   (picture, x, x[:, :2], 1)):  # fmt: skip
-        with pytest.raises(ValueError, match="expected a picture"):
-            compiled.read(*wrong)
+        refused("expected a picture", compiled.read, *wrong)
     with pytest.raises(TypeError):
         compiled.read(picture.astype(np.int16), x, x, 1)

@@ -25,7 +25,7 @@ from darswin.models import load_model
 # Damaged files of each kind: in `make test`, and in `make fuzz`.
 DAMAGED = 2000 if hypothesis.settings().max_examples <= 30 else 100_000
 COPY, SIZE = 3, (4, 6)
-PAGE = Path(__file__).parents[1] / "docs/reference/files.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/files.md"
 
 
 def whole(content: bytes) -> bytes:
