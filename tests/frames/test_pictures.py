@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from frame_samples import MEAN, STD, bilinear, random_frame
+from frame_samples import MEAN, STD, bilinear, by_numpy, random_frame
+from hypothesis import given
+from hypothesis import strategies as st
 
 from darswin import frames
 from darswin.deploy import camera
