@@ -1,7 +1,8 @@
 """Fills the tables of README and pages from what benchmarks and studies found: `make tables`.
 
 In a benchmark's table "a / b" is at one and at two threads, and a ratio is the time of what one
-would write without the operator, over ours.
+would write without the operator, over ours. The numbers in sentences are not filled: marks
+`<!-- numbers: … -->` say what they are, and tests/docs/test_claims.py compares them.
 """
 
 import json
