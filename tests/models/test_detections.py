@@ -74,7 +74,7 @@ def disks(lens):
 def test_detections_of_every_view_come_back_to_the_things_in_the_picture(name, kind):
     lens = LENSES[kind]
     images, exact = disks(lens)
-    size = {"none": SIZE, "tiles": (320, 320)}.get(name, (480, 480))
+    size = {"none": SIZE, "tiles": (256, 256)}.get(name, (400, 400))
     (found,) = LensAdapter(Disks(), view=make_view(name, size))(images, lens)
     shows = range(3 if name == "perspective" else 4)  # it ends at 50°
     assert set(found["labels"].tolist()) >= {*shows}
