@@ -197,7 +197,7 @@ sdist: $(STAMP)  ## build the sdist in dist/, and test it in a fresh environment
 	rm -f dist/darswin-*.tar.gz
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	"$(PYTHON)" -m venv --clear $(SCRATCH)
-	$(SCRATCH)/bin/pip install -q $$(grep -E '^(cmake|hypothesis|ninja|pybind11|pytest|setuptools|torch)==' requirements.txt)
+	$(SCRATCH)/bin/pip install -q $$(grep -E '^(allpairspy|cmake|hypothesis|ninja|pybind11|pytest|setuptools|torch)==' requirements.txt)
 	PATH=$(ROOT)/$(SCRATCH)/bin:$$PATH $(SCRATCH)/bin/pip install -q --no-build-isolation dist/darswin-*.tar.gz
 	$(SCRATCH)/bin/python tests/installed.py
 
@@ -237,7 +237,7 @@ test-torch:  ## test the wheel with TORCH="2.10.0 2.11.0 …" on PYTHON; downloa
 	  echo "== torch $$version on $(PYTHON)"; \
 	  "$(PYTHON)" -m venv --clear $(SCRATCH); \
 	  $(SCRATCH)/bin/pip install -q torch==$$version dist/darswin-*-manylinux_2_28_$$(uname -m).whl \
-	    $$(grep -E '^(hypothesis|pytest)==' requirements.txt); \
+	    $$(grep -E '^(allpairspy|hypothesis|pytest)==' requirements.txt); \
 	  $(SCRATCH)/bin/python tests/installed.py; \
 	done
 
@@ -255,7 +255,7 @@ $(AARCH64)/installed: requirements.txt
 	  --include=libstdc++6,python3-dev,python3-pip bookworm $(AARCH64)/root
 	cp $(AARCH64)/root/usr/include/aarch64-linux-gnu/python3.11/pyconfig.h $(AARCH64_PYTHON)
 	$(EMULATED) -m pip install -q --target $(AARCH64)/site torch==2.10.0 \
-	  $$(grep -E '^(hypothesis|numpy|opencv-python-headless|pytest|pyyaml|safetensors|scikit-learn)==' \
+	  $$(grep -E '^(allpairspy|hypothesis|numpy|opencv-python-headless|pytest|pyyaml|safetensors|scikit-learn)==' \
 	    requirements.txt)
 	@touch $@
 

@@ -35,7 +35,7 @@ def product(*tables):
     fast = {tuple(k % len(table) for table in tables) for k in range(max(map(len, tables)))}
     # The fast rows have their pairs already.
     pairs = {*map(tuple, AllPairs(places, previously_tested=sorted(map(list, fast))))}
-    marks = {row: slow for row in pairs} | {row: [] for row in fast}
+    marks = dict.fromkeys(pairs, slow) | dict.fromkeys(fast, ())
     return [
         pytest.param(*map(list.__getitem__, tables, row), marks=marks.get(row, [slow, products]))
         for row in itertools.product(*places)

@@ -3,7 +3,7 @@ operators and of darswin.frames, or, without the compiled modules, those of mode
 
     python tests/installed.py [options of pytest]
 
-Beside darswin it needs pytest and hypothesis.
+Beside darswin it needs pytest, hypothesis and allpairspy.
 """
 
 import contextlib

@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-PINNED = ("torch", "pytest", "hypothesis", "onnxruntime")
+PINNED = ("torch", "pytest", "hypothesis", "allpairspy", "onnxruntime")
 
 
 def lowest() -> list[str]:

@@ -169,11 +169,12 @@ def test_the_program_of_a_dense_model_with_rays(lens, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "lens", "written", "input", "fixed", "pixels"),
     [
-        pytest.param(*row.values, marks=slow)
+        # Each value once, and the pairs in `make test-products`. The whole would take hours.
+        pytest.param(*row.values, marks=[slow, products] if row.marks else slow)
         for row in product(
             KINDS, THREE, ["program", "onnx"], ["images", "tokens"], [False, True], PIXELS
         )
-        if products not in row.marks  # hours
+        if products not in row.marks
     ],
 )
 def test_every_model(kind, lens, written, input, fixed, pixels, tmp_path):
@@ -196,9 +197,20 @@ def test_openvino(kind, lens, fixed, tmp_path):
     check(kind, lens, "openvino", "images", fixed, tmp_path / "model.onnx")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lens", [*LENS_MODELS, *GENERAL])
-@pytest.mark.parametrize("kind", ["classifier A", "conv"])
+# A search for the angle in a table, along the radius and in the plane.
+SEARCHES = ("Tabulated", "Polynomial", "Mei, general")
+
+
+@pytest.mark.parametrize(
+    ("kind", "lens"),
+    [
+        *(pytest.param("classifier A", lens, marks=slow) for lens in (*LENS_MODELS, *GENERAL)),
+        *(
+            pytest.param("conv", lens, marks=slow if lens in SEARCHES else [slow, products])
+            for lens in (*LENS_MODELS, *GENERAL)
+        ),
+    ],
+)
 def test_every_lens(kind, lens, tmp_path):
     # The search in the plane is long: one of its lenses is enough in ONNX.
     dense = kind == "conv"
