@@ -71,15 +71,18 @@ def test_corners_are_found_where_they_are(kind, fov, usual, share):
 
 @pytest.mark.parametrize("kind", ["charuco", "april"])
 def test_a_board_with_markers_keeps_its_numbers_if_seen_in_part_and_is_never_mirrored(kind):
-    board = BOARDS[kind]
-    for picture, true in shots(camera(120, (360, 360)), board, 2, seed=3):
+    board, found_some = BOARDS[kind], 0
+    for picture, true in shots(camera(120, (360, 360)), board, 3, seed=3):
         # A hand lies on a part of the board.
         middle = np.nanquantile(true[:, 0], 0.6)
         covered = picture.copy()
         covered[:, int(middle) :] = 90
         found = find_corners(covered, board)
         assert np.isnan(found[true[:, 0] > middle + 3]).all()
-        assert np.nanmedian(np.linalg.norm(found - true, axis=1)) < 0.4
+        if (seen := np.isfinite(found[:, 0])).any():
+            assert np.median(np.linalg.norm(found - true, axis=1)[seen]) < 0.4
+            found_some += 1
+    assert found_some >= 2
     assert np.isfinite(find_corners(picture, board)).sum() > 20
     assert np.isnan(find_corners(picture[:, ::-1], board)).all()
 

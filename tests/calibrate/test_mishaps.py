@@ -1,10 +1,14 @@
-"""Nothing is silent: a lens that is wrong is refused or doubted."""
+"""Nothing is silent: a lens that is wrong is refused or doubted, and a right one is not."""
 
 import re
 
 import pytest
 from helpers import slow_but
 from mishaps import outcome
+from rigs import ray_errors, rig, true_lens
+
+from darswin.calibrate import calibrate
+from darswin.calibrate.doubts import Note
 
 SAID = {
     "two cameras, alike": (60, 3, "the rays are unsure by .* pictures disagree"),
@@ -27,3 +31,16 @@ def test_mishaps_are_told(name):
     _, kind, why = outcome(name, fov, seed)
     assert kind in ("error", "looks wrong")
     assert re.search(words, why), why
+
+
+GOOD = [("Perspective", 60), ("KannalaBrandt", 100), ("Equidistant", 150), ("EnhancedUnified", 220)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "fov"), GOOD)
+def test_good_pictures_are_not_doubted(model, fov):
+    true = rig(true_lens(model, fov, seed=1), 15, noise=0.1, seed=1)
+    found = calibrate(true.corners, true.board, true.size, model)
+    assert not [text for text in found.doubts if not isinstance(text, Note)]
+    off = ray_errors(found.lens, true.lens, best=True)
+    assert off.quantile(0.95) < 0.2
