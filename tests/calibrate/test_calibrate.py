@@ -220,7 +220,7 @@ def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model, ratio,
 def test_the_ratio_of_a_pixels_sides_is_always_or_never_free():
     lens = true_lens("KannalaBrandt", 180)
     lens = lens.replace(affine=torch.tensor([[[1, 0], [0, 1.03]]], dtype=f64))
-    seen = rig(lens, 5, noise=0.05)
+    seen = rig(lens, 15)
     found, square = (of(seen, square_pixels=held) for held in (False, True))
     assert abs(found.lens.affine[0, 1, 1] - 1.03) < 1e-3 and "affine[3]" in found.parameters
     assert ray_errors(found.lens, lens, best=True).median() < 0.03
