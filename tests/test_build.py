@@ -119,15 +119,19 @@ def test_build_info():
     assert info["cxx_standard"] >= 202002 and "stable" in info["torch_abi"]
 
 
+def block(page: str, heading: str, language: str) -> str:
+    """The first block of code of a language after a heading of a page."""
+    _, section = (ROOT / page).read_text().split(f"\n{heading}\n")
+    return section.partition(f"\n```{language}\n")[2].partition("```")[0]
+
+
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory) -> Path:
-    """The unpacked sdist, and in its `dist` the wheel made of it: without optimization, in a
-    fraction of the time."""
-    folder, build = (
-        tmp_path_factory.mktemp("sdist"),
-        [sys.executable, "-m", "build", "--no-isolation"],
-    )
-    output(*build, "--sdist", "--outdir", folder, ROOT)
+    """The unpacked sdist after README's lines were pasted there into an empty environment, with our
+    version of torch for the newest, and in its `dist` a wheel: without optimization, in a fraction
+    of the time."""
+    folder = tmp_path_factory.mktemp("sdist")
+    output(sys.executable, *["-m", "build", "--no-isolation", "--sdist", "--outdir"], folder, ROOT)
     (sdist,) = folder.glob("darswin-*.tar.gz")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
@@ -136,9 +140,33 @@ def unpacked(tmp_path_factory) -> Path:
     another = sources / "another-python"
     another.write_text(f"#!/bin/sh\necho .another-python.so:{sysconfig.get_path('include')}\n")
     another.chmod(0o755)
-    environment = {"CMAKE_BUILD_TYPE": "None", "DARSWIN_PYTHONS": str(another)}
-    output(*build, "--wheel", sources, env=environment)
+    ours = Path(sys.executable).parent
+    path = [place for place in os.environ["PATH"].split(":") if Path(place) != ours]
+    environment = dict(
+        PATH=":".join(path), PYTHONPATH="", CMAKE_BUILD_TYPE="None", DARSWIN_PYTHONS=str(another)
+    )
+    lines = re.search(
+        r"^## Install\n.*?^```sh\n(.*?)^```", (ROOT / "README.md").read_text(), SECTION
+    )
+    torch_line, *others = lines[1].splitlines()
+    assert torch_line == "pip install torch"
+    (version,) = re.findall(r"^torch==.*", (ROOT / "requirements.txt").read_text(), re.M)
+    lines = [
+        "set -e", f"{shlex.quote(sys.executable)} -m venv empty", ". empty/bin/activate",
+        f"pip install {version}", *others,
+        "pip wheel --no-deps --no-build-isolation --wheel-dir dist .",
+    ]  # fmt: skip
+    printed = output("sh", "-c", "\n".join(lines), cwd=sources, env=environment)
+    (sources / "printed").write_text(printed)
     return sources
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_install_darswin_and_print_what_the_page_says(unpacked):
+    (shown,) = re.findall(
+        r"^```text\n(.*?)^```", (ROOT / "docs/howto/install.md").read_text(), SECTION
+    )
+    assert shown in (unpacked / "printed").read_text()
 
 
 @pytest.mark.parametrize("optimized", [True, pytest.param(False, marks=pytest.mark.slow)])

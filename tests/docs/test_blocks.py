@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import fixture
+from packaging.requirements import Requirement
 from scenes import write_outlines, write_plain, write_woodscape
 from videos import write_video
 
@@ -154,13 +155,13 @@ def check_pip(arguments: list[str], monkeypatch) -> None:
     content = tomllib.loads((ROOT / "pyproject.toml").read_text())
     extras = content["project"]["optional-dependencies"]
     asked = [*content["build-system"]["requires"], *(p for e in extras.values() for p in e)]
-    names = {re.match(r"[\w.-]+", requirement)[0] for requirement in asked}
+    names = {Requirement(requirement).name for requirement in asked}
     assert arguments[0] == "install"
     for word in arguments[1:]:
         if word.startswith("."):
-            assert word == "." or word[2:-1] in extras, word
-        else:
-            assert word in ("--no-build-isolation", "-e", *names), word
+            assert {*filter(None, word[2:-1].split(","))} <= extras.keys(), word
+        elif word not in ("--no-build-isolation", "-e", "-U"):
+            assert Requirement(word).name in names, word
 
 
 def check_export(arguments: list[str], monkeypatch) -> None:
