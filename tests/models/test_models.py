@@ -141,8 +141,10 @@ def test_one_preparation_serves_pixels_of_any_kind_and_the_reference_agrees(case
         general = KannalaBrandt(9.0, [0.01], 1.5, affine=affine, tangential=tangential)
         others = [CAMERAS[0].resized(size), general]
     for lens in (lenses, *others):
-        prepared, out = model.prepare(lens, size), model(planes, lens)
-        assert_equal(model.run(frames, prepared), out)
+        prepared = model.prepare(lens, size)
+        for pixels in (frames, planes):
+            out = model(pixels, lens)
+            assert_equal(model.run(pixels, prepared), out)
         assert all(tensor.isfinite().all() for tensor in tensors_of(out))
         assert_close(model.run((planes / 255 - mean) / std, prepared), out, 1e-3)
         with use_reference():
