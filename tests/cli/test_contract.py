@@ -256,7 +256,7 @@ def test_a_foreign_folder_is_refused_and_the_commands_own_is_not(run, command, c
 
 WRITERS = {
     "show": "lens show lens.json in/a.png --rings 2 --sectors 4 --out old.png",
-    "convert": "lens convert lens.json old.json --model Mei",
+    "convert": "lens convert lens.json old.json",
     "crop": "lens crop lens.json old.json --size 32,48",
 }
 
@@ -334,7 +334,6 @@ def test_what_is_no_file_is_refused_at_once(run, capsys, kind, monkeypatch):
         ("predict in/a.png --model f.safetensors --lens lens.json", "f.safetensors"),
         ("lens undistort lens.json in --out out", "in/f.png"),
         ("lens calibrate f.png --board 6x5 --square 1", "f.png"),
-        ("lens info f.json", "f.json"),
         ("warp f.json --to mercator --lens lens.json --out out", "f.json"),
         ("fit --run r --data.path digits --data.lens f.json", "f.json"),
     ):
