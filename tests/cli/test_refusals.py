@@ -97,8 +97,10 @@ REFUSED = {
         bytes.onnx --std 0.2 => bytes.onnx takes pixels of uint8: leave --mean and --std
         gone.onnx => there is no file gone.onnx
     """,
-    "warp set/instances.json --out new": r"""
+    "warp deep/set/instances.json --out new": r"""
         --to wide.json => missing --lens: .*instances.json has no calibration
+    """,
+    "warp set/instances.json --out new": r"""
         --to wide.json --lens wide.json --processes 0 => --processes must be at least 1, got 0
         --to wide.json --lens wide.json --size 0,5 => --size must be at least 1,1
         --to wide.json --lens wide.json --up 0,1,0 => --up must be left out unless --to is a view
@@ -297,6 +299,7 @@ FILES_OF_TEXT = {
     "out/undistorted.json": [],
     "boards/0.png": "no picture",
     "set/instances.json": SET,
+    "deep/set/instances.json": SET,
     "lone/instances.json": SET,
     "two/annotations/instances.json": SET,
     "two/annotations/other.json": SET,
@@ -325,7 +328,7 @@ def world(tmp_path_factory):
         (folder / name).write_text(text)
     noise = np.random.default_rng(0).integers(256, size=(64, 96, 3), dtype=np.uint8)
     pictures = dict.fromkeys(("p.png", "in/p.png", "out/p.png", "more/own/b.png"), noise)
-    pictures |= {"set/images/0.png": noise, "lone/images/0.png": noise}
+    pictures |= {f"{name}/images/0.png": noise for name in ("set", "deep/set", "lone")}
     pictures |= {"even.png": np.full((90, 120, 3), 80, np.uint8)}
     pictures |= {"front.png": np.zeros((483, 640, 3)), "square.png": np.zeros((40, 40, 3))}
     for name, picture in pictures.items():
