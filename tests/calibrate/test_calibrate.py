@@ -57,7 +57,7 @@ def few():
 
 @pytest.mark.parametrize(("model", "fov"), slow_but(
     WIDE + [(model, 60) for model in NARROW],
-    ("Equisolid", 250),
+    ("Equisolid", 250), ("Tabulated", 250),
 ))  # fmt: skip
 def test_twenty_pictures_give_every_model(model, fov):
     lens = true_lens(model, fov)
