@@ -45,4 +45,4 @@ def test_an_export_to_onnx_prints_only_our_own_lines(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = (done.stdout + done.stderr).splitlines()
-    assert [line for line in lines if not line.startswith("darswin: translating the graph")] == []
+    assert [line for line in lines if not line.startswith("darswin: ")] == []  # signs of life
