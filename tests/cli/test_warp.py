@@ -428,7 +428,7 @@ def test_where_labels_and_pictures_are(flat, monkeypatch):
     Path("set/annotations/instances.json").write_text(flat.read_text())
     assert len(read_coco(warp("set", WIDE))) == 3
     Path("labels.json").write_text(flat.read_text())
-    warp("labels.json", WIDE, f"--pictures {flat.parent / 'images'}", out="2")
+    warp("labels.json", WIDE, "--pictures set/images", out="2")
     assert len(list(Path("2/images").iterdir())) == 3
     out = Path("3").absolute()
     monkeypatch.chdir(flat.parent)
