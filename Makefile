@@ -62,7 +62,7 @@ test-numerics-%: build
 test-all: build  ## run all tests, also those that compile graphs, start processes, train or run the docs
 	$(PYTEST) -m "not products"
 
-test-products: build  ## run the rows of large tables of tests that `make test-all` leaves out (N minutes)
+test-products: build  ## run the rows of large tables of tests that `make test-all` leaves out
 	$(PYTEST) -m products
 
 # All requirements in pyproject.toml except torch, at their lowest versions.
@@ -78,7 +78,7 @@ test-lowest: build $(LOWEST)/installed  ## test the commands, files, pictures an
 	PYTHONPATH=$(ROOT) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
 	  tests/cli tests/viz \
 	  tests/deploy/test_export.py tests/deploy/test_every_export.py \
-	  -k "not program and not package and not every_lens and not openvino"
+	  -m "not products" -k "not program and not package and not every_lens and not openvino"
 
 test-isa: build  ## test the operators on every instruction-set tier of this machine
 	@set -e; for tier in $(TIERS); do \

@@ -243,7 +243,9 @@ def test_a_stream_ends_by_ctrl_c_with_its_predictions(disc, monkeypatch, capsys)
             assert source == "rtsp://me:secret@host/door"
 
         isOpened = release = lambda self: True  # noqa: N815
-        read = lambda self: (True, picture)  # noqa: E731
+
+        def read(self):
+            return True, picture
 
     seen, add = [], NetworkAnswers.add
 
