@@ -1,19 +1,17 @@
-"""Numbers of the records: scores, errors, intervals and the tables that count them."""
+"""Numbers of the records: scores, errors and intervals. Their tables are held by those of the
+pages: see docs/test_claims.py."""
 
 import calibrate_real
 import numpy as np
 import pytest
 import rigs
 import sizes_scene
-import tables
 import torch
 from calibrate_peers import Found
 from calibrate_rays import ray_errors
 from calibrate_real import SQUARE, left_out, miss
-from cells import SWEEP, ablations, augmented, headline
+from cells import ablations, augmented, headline
 from dense_cells import CONTROLLED, STUDIED, STUDIED_MODELS, all_cells
-from estimate_tables import MODELS as ESTIMATED
-from estimate_tables import tables as estimate_tables
 from learned_lens import KNOWN, distance, lens_of
 from pretrained_methods import Found as Detected
 from pretrained_scenes import COCO, Thing
@@ -139,49 +137,3 @@ def test_wrong_lenses_scale_the_angle_of_each_pixel():
     for factor in (0.8, 1.25):
         found = sizes_scene.with_angles_scaled(lens, factor).unproject(radii)
         torch.testing.assert_close(found, factor * lens.unproject(radii), atol=2e-4, rtol=1e-3)
-
-
-# -- tables -------------------------------------------------------------------------------------
-
-
-def test_tables_of_estimates_count_what_the_record_holds():
-    def result(error, holds=True, doubts=()):
-        return dict(true=50.0, rim=50.0, error=error, low=40.0, high=60.0, holds=holds,
-                    doubts=list(doubts))  # fmt: skip
-
-    good, bad, refused = result(-2.9), result(5.1, False, ["guess"]), dict(refused="too few")
-    lens = dict(
-        name="a lens", all=dict.fromkeys(ESTIMATED, good),
-        single={model: [good, bad, refused] for model in ESTIMATED}, long=[10, 9, 30],
-        digits=dict(
-            true=95.0, estimated=dict(Spherical=93.1, KannalaBrandt=92.9, Division=90.0),
-            single=[94.0, 92.0, None], wrong=dict(guess=60.0),
-        ),
-    )  # fmt: skip
-    all_bad = dict(Spherical=refused, KannalaBrandt=bad, Division=bad)
-    record = dict(lenses=[lens], real=[dict(camera="left", pictures=3, all=all_bad)])
-    made = estimate_tables(record)
-    rows = {name.split(" ", 1)[1]: table.splitlines()[2:] for name, table in made.items()}
-    assert rows["rims"] == ["| a lens | 50.0 | -2.9 | -2.9 | -2.9 | 40.0–60.0 |"]
-    assert rows["single"] == [
-        f"| {name} | 4.0 | 4.0 | 4.0 | 1/3 | 1/1 | 1/2 | 1 |" for name in ("a lens", "all")
-    ]
-    assert rows["digits"] == ["| a lens | 95.0 | 93.1 | 92.9 | 90.0 | 93.0 (92.0) | 60.0 |"]
-    assert rows["real"] == ["| left | 3 | 50.0 | refused | +5.1 | +5.1 | 40.0–60.0 (no) | guess |"]
-    reached = [row.split(" | ")[-1] for row in rows["targets"]]
-    assert reached == ["1/1 |", "1/2 |", "1/1 |", "1/1 |", "1/2 |", "0/1 |"]
-
-
-def test_what_8_bits_lose():
-    def cell(label: str, seed: int, after: list[float], changed: float) -> dict:
-        accuracy = dict(float32=dict.fromkeys(SWEEP, 50.0), int8=dict.fromkeys(SWEEP, 50.0))
-        accuracy["int8"] |= dict(zip(SWEEP, after, strict=False))
-        changes = dict.fromkeys(SWEEP, changed)
-        return dict(label=label, seed=seed, layers=[8, 9], accuracy=accuracy, changed=changes)
-
-    cells = [cell("Swin", 0, [48.0, 50.4], 1.0), cell("Swin", 1, [50.0, 49.0], 2.0)]
-    assert tables.points_lost(cells[0])[:3] == pytest.approx([2.0, -0.4, 0.0])
-    # 2.6 points of 42 tests in all; 1 of the first ξ on average, 2 with the first seed.
-    *others, row = tables.int8_table(cells).splitlines()
-    assert others[2].startswith("| DarSwin-A | not run |")
-    assert row == "| Swin | 8 of 9 | 50.00 | 49.94 | 0.06 | 1.00 | 2.0 | 1.5 |"
