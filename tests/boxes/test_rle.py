@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import refused
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -88,5 +89,4 @@ def test_long_runs_are_those_of_coco():
     ],
 )  # fmt: skip
 def test_wrong_encodings_are_refused(rle, said):
-    with pytest.raises(ValueError, match=said):
-        boxes.decode_rle(rle)
+    refused(said, boxes.decode_rle, rle)

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
@@ -286,8 +287,7 @@ def test_how_turns_are_drawn():
     assert abs(angles.mean()) < 2 and 0.45 < np.mean([turn.mirrored for turn in turns]) < 0.55
     assert RandomTurns(False, 0).draw(rng) == (0.0, False)
     for angle in (-1, 181, math.nan):
-        with pytest.raises(ValueError, match=r"`rotate_deg` must be in \[0, 180\]"):
-            RandomTurns(rotate_deg=angle)
+        refused(r"`rotate_deg` must be in \[0, 180\]", RandomTurns, rotate_deg=angle)
 
 
 # -- targets are not shifted ------------------------------------------------------------------

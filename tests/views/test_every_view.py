@@ -12,7 +12,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from frame_samples import bilinear
-from helpers import in_turn
+from helpers import in_turn, refused
 from torch import nn
 from torch.testing import assert_close
 from torch.utils._pytree import tree_leaves
@@ -350,15 +350,13 @@ def test_frames_of_uint8_are_normalized(name):
     assert exact.dtype == torch.float64
     assert_close(exact.float(), view(planes, lens), rtol=1e-4, atol=1e-4)
     refuses = make_view(name, (16, 16), mean=None, std=None)
-    with pytest.raises((TypeError, ValueError), match="mean"):
-        refuses(frames, lens)
+    refused("mean", refuses, frames, lens, error=(TypeError, ValueError))
     for mean, std, message in (
         (0.5, 0.0, r"std must be positive, got 0\.0"),
         ((0.1, 0.2), (0.1, 0.2, 0.3), r"mean must be one number or one per channel \(3\)"),
         (None, 0.5, "mean and std must be given together, got None and 0.5"),
     ):
-        with pytest.raises(ValueError, match=message):
-            make_view(name, (16, 16), mean=mean, std=std)
+        refused(message, make_view, name, (16, 16), mean=mean, std=std)
 
 
 def convolution():
@@ -389,8 +387,7 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float64)
 def test_networks_get_what_the_view_sees_in_their_dtype(kind, name, dtype):
     make = NETWORKS[kind]
     if name == "tiles" and "adapter" not in kind:
-        with pytest.raises(ValueError, match="one picture of each image, but the view shows 5"):
-            make(name)
+        refused("one picture of each image, but the view shows 5", make, name)
         return
     model, frames = make(name).to(dtype).eval(), torch.randint(256, (2, 32, 32, 3)).byte()
     lens = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -428,8 +425,7 @@ def test_a_view_of_ones_own_needs_two_methods(monkeypatch):
         test_networks_get_what_the_view_sees_in_their_dtype(kind, "own", torch.bfloat16)
     assert repr(make_view("own", (24, 32))) == "AnyRatio(size=(24, 32))"
     monkeypatch.setitem(_VIEWS, "own", lambda _size: View())
-    with pytest.raises(TypeError, match="'own' has no option 'mean'; it has none"):
-        make_view("own", (24, 32))
+    refused("'own' has no option 'mean'; it has none", make_view, "own", (24, 32), error=TypeError)
 
 
 def test_a_view_of_ones_own_has_a_name(monkeypatch):
@@ -445,10 +441,8 @@ def test_a_view_of_ones_own_has_a_name(monkeypatch):
 @pytest.mark.parametrize("name", sorted(set(list_views()) - {"none"}))
 def test_lenses_and_pixels_that_do_not_fit_are_refused(name):
     view, lens, images = make_view(name, (16, 16)), LENSES["two"], torch.rand(3, 3, *SIZE)
-    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
-        view(images, lens)
-    with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
-        view(images)
+    refused("each of the 3 images, got 2", view, images, lens)
+    refused(r"lens must be a darswin\.lens\.Lens, got NoneType", view, images, error=TypeError)
     with pytest.raises(ValueError, match=r"images of \(H, W\) = \(90, 120\), got images of \(9"):
         view(torch.rand(1, 3, 9, 9), lens)
     prepared = view.prepare(lens, SIZE)
@@ -464,15 +458,12 @@ def test_images_of_ints_and_wrong_sizes_are_refused(name):
         view = make_view(name, size)
         assert (view.map_size if name == "polar" else view.size) == (16, 16)
     for wrong in (16.5, (16.0, 16.0), (16,), "16"):
-        with pytest.raises(TypeError, match="size must be a pair of ints, got"):
-            make_view(name, wrong)
+        refused("size must be a pair of ints, got", make_view, name, wrong, error=TypeError)
     for wrong in ((0, 0), (-4, -4)):
-        with pytest.raises(ValueError, match=r"must be (an int of )?at least 1"):
-            make_view(name, wrong)
+        refused(r"must be (an int of )?at least 1", make_view, name, wrong)
     with pytest.raises(TypeError, match=r"images? must be "):
         make_view(name, (16, 16))(torch.zeros(1, 3, *SIZE, dtype=torch.int32), LENSES["cut"])
     if name != "polar":
         remap = view_of(name).at(LENSES["cut"], SIZE)
         for move in (remap.to_image, remap.to_view):
-            with pytest.raises(ValueError, match=r"points must have shape \(..., 2\), got \(3,\)"):
-                move([1.0, 2.0, 3.0])
+            refused(r"points must have shape \(..., 2\), got \(3,\)", move, [1.0, 2.0, 3.0])
