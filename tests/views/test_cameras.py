@@ -196,8 +196,6 @@ def test_the_pixels_beyond_the_view_are_those_of_the_lens(name):
             assert beyond.any() or name == "pinhole"
 
 
-# -- points move as the pixels do -------------------------------------------------------------
-
 OBLIQUE = KannalaBrandt(
     40.0, [0.01], 1.3, [70.0, 60.0], affine=[[1.0, 0.1], [0.0, 0.8]], image_size=(120, 140)
 )
@@ -256,18 +254,11 @@ def test_pixels_are_read_at_their_points(name):
         assert ((away < -1) | (away > remap.size[::-1])).any(-1).all()
 
 
-def test_what_has_no_place_stays_as_it_is():
-    image = np.zeros((*SIZE, 3), np.uint8)
-    lens = LENSES["circle"]
-    for target in (7, None):
-        for view in (CropView((0, 0, 90, 80), (9, 8)), CameraView(TARGETS[0])):
-            shown = Sample(image, target, lens).through(view)
-            assert shown.target is target and size_of(shown.lens) == view.size
-            assert shown.image.shape == (*view.size, 3)
-
-
 def test_only_what_must_turn_with_a_picture_does():
     image = np.random.default_rng(0).integers(256, size=(*SIZE, 3), dtype=np.uint8)
+    for view in (CropView((0, 0, 90, 80), (9, 8)), CameraView(TARGETS[0])):
+        shown = Sample(image, 7, LENSES["circle"]).through(view)
+        assert shown.target == 7 and shown.image.shape == (*size_of(shown.lens), 3)
 
     def whole_turned(lens, turn):
         return Sample(image, None, lens).through(CropView((0, 0, *SIZE), SIZE, turn))
@@ -288,9 +279,6 @@ def test_how_turns_are_drawn():
     assert RandomTurns(False, 0).draw(rng) == (0.0, False)
     for angle in (-1, 181, math.nan):
         refused(r"`rotate_deg` must be in \[0, 180\]", RandomTurns, rotate_deg=angle)
-
-
-# -- targets are not shifted ------------------------------------------------------------------
 
 
 def ramp(size, axis=0, dtype=np.float32):
@@ -341,22 +329,11 @@ def test_targets_are_not_shifted(whole, size, frame):
             # A column in the middle may have no pixel that is nearest and none that mirrors it.
             limit = 0.5 / pixel / (size - 2 * margin) * (size % 2) + 2e-3
             assert abs(off[known].mean()) < limit
-
-
-@pytest.mark.parametrize(("whole", "size"), SIZES)
-def test_a_mirrored_picture_has_mirrored_targets(whole, size):
-    taken = 0, 0, *whole
-    plain, mirrored = (
-        cropped(ramp(whole), taken, size, Turn(mirrored=m)).target for m in (False, True)
-    )
-    same = plain[:, ::-1] == mirrored
-    same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
-    assert same.all()
-
-
-# -- batches of lenses, and gradients
-
-f64 = torch.float64
+    if frame == "mirrored":
+        plain = cropped(ramp(whole), (0, 0, *whole), size).target
+        same = plain[:, ::-1] == FRAMES[frame](ramp(whole), (0, 0, *whole), size).target
+        same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
+        assert same.all()
 
 
 def test_another_camera_is_read_bilinear_between_pixel_centres():
@@ -398,17 +375,7 @@ def test_gradients_reach_both_lenses_also_at_the_centre_and_where_nothing_is_see
         return CameraView(target, (9, 9), supersampling=1).image_points(source, (40, 40))
 
     parameters = [[2.9], [1.5], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
-    tensors = [torch.tensor(p, dtype=f64, requires_grad=True) for p in parameters]
+    tensors = [torch.tensor(p, dtype=torch.float64, requires_grad=True) for p in parameters]
     there = places(*tensors)
     assert (there == OUTSIDE).any() and (there[0, 4, 4] != OUTSIDE).all()
     assert torch.autograd.gradcheck(places, tensors, fast_mode=True)
-
-
-@pytest.mark.parametrize("turn", TURNS)
-def test_rays_of_another_camera_come_back_to_its_points(turn):
-    view = CameraView(TARGETS[0], turn=turn)
-    points = 20 + 88 * torch.rand(50, 2)
-    rays = view.to_rays(points, LENSES["circle"], SIZE)
-    assert not rays.isnan().any()
-    back = view.to_points(rays, LENSES["circle"], SIZE)
-    torch.testing.assert_close(back, points, rtol=0, atol=1e-3)

@@ -320,9 +320,6 @@ def test_of_every_view(holds, name, kind):
     holds(name, LENSES[kind])
 
 
-# -- of every view, whatever the lens -----------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMED)
 @pytest.mark.parametrize("tangential", [None, [[0.02, 0.01]]])
 def test_gradients_reach_images_and_lens(name, tangential):
@@ -415,7 +412,10 @@ class AnyRatio(PixelView):
         return self.of(lens).project_points(rays, self.size)
 
 
-def test_a_view_of_ones_own_needs_two_methods(monkeypatch):
+def test_a_view_of_ones_own_needs_two_methods_and_has_a_name(monkeypatch):
+    monkeypatch.setitem(_VIEWS, "tall polar", None)  # and is removed again
+    register_view("tall polar")(lambda size, **_: PolarView(*size, samples=(2, 1), layout="image"))
+    assert make_view("tall polar", (16, 8)).map_size == (32, 8)
     monkeypatch.setitem(_VIEWS, "own", AnyRatio)
     test_gradients_reach_images_and_lens("own", None)
     what_is_seen_comes_back_also_from_coarser_maps("own", LENSES["general"])
@@ -428,32 +428,8 @@ def test_a_view_of_ones_own_needs_two_methods(monkeypatch):
     refused("'own' has no option 'mean'; it has none", make_view, "own", (24, 32), error=TypeError)
 
 
-def test_a_view_of_ones_own_has_a_name(monkeypatch):
-    monkeypatch.setitem(_VIEWS, "tall polar", None)  # and is removed again
-    register_view("tall polar")(
-        lambda size, **options: PolarView(*size, samples=(2, 1), layout="image", **options)
-    )
-    adapter = LensAdapter(nn.Identity(), (16, 8), view="tall polar")
-    assert adapter.view.map_size == (32, 8)
-    assert adapter(torch.rand(1, 3, *SIZE), LENSES["circle"]).shape == (1, 3, *SIZE)
-
-
-@pytest.mark.parametrize("name", sorted(set(list_views()) - {"none"}))
-def test_lenses_and_pixels_that_do_not_fit_are_refused(name):
-    view, lens, images = make_view(name, (16, 16)), LENSES["two"], torch.rand(3, 3, *SIZE)
-    refused("each of the 3 images, got 2", view, images, lens)
-    refused(r"lens must be a darswin\.lens\.Lens, got NoneType", view, images, error=TypeError)
-    with pytest.raises(ValueError, match=r"images of \(H, W\) = \(90, 120\), got images of \(9"):
-        view(torch.rand(1, 3, 9, 9), lens)
-    prepared = view.prepare(lens, SIZE)
-    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
-        view.check_seen(torch.rand(3 * view.count, 3, 16, 16), prepared, 3)
-    with pytest.raises(ValueError, match=r"\(H, W\) = \(16, 16\), got \(16, 17\)"):
-        view.check_seen(torch.rand(2, 3, 16, 17), prepared, 3)
-
-
 @every_view
-def test_images_of_ints_and_wrong_sizes_are_refused(name):
+def test_sizes_images_lenses_and_pixels_that_do_not_fit_are_refused(name):
     for size in ([16, 16], (np.int64(16), 16), 16):
         view = make_view(name, size)
         assert (view.map_size if name == "polar" else view.size) == (16, 16)
@@ -461,9 +437,20 @@ def test_images_of_ints_and_wrong_sizes_are_refused(name):
         refused("size must be a pair of ints, got", make_view, name, wrong, error=TypeError)
     for wrong in ((0, 0), (-4, -4)):
         refused(r"must be (an int of )?at least 1", make_view, name, wrong)
-    with pytest.raises(TypeError, match=r"images? must be "):
-        make_view(name, (16, 16))(torch.zeros(1, 3, *SIZE, dtype=torch.int32), LENSES["cut"])
+    integers = torch.zeros(1, 3, *SIZE, dtype=torch.int32)
+    refused(r"images? must be ", view, integers, LENSES["cut"], error=TypeError)
     if name != "polar":
         remap = view_of(name).at(LENSES["cut"], SIZE)
         for move in (remap.to_image, remap.to_view):
             refused(r"points must have shape \(..., 2\), got \(3,\)", move, [1.0, 2.0, 3.0])
+    if name == "none":
+        return
+    lens, images = LENSES["two"], torch.rand(3, 3, *SIZE)
+    refused("each of the 3 images, got 2", view, images, lens)
+    refused(r"lens must be a darswin\.lens\.Lens, got NoneType", view, images, error=TypeError)
+    said = r"images of \(H, W\) = \(90, 120\), got images of \(9"
+    refused(said, view, torch.rand(1, 3, 9, 9), lens)
+    prepared, seen = view.prepare(lens, SIZE), torch.rand(3 * view.count, 3, 16, 16)
+    refused("each of the 3 images, got 2", view.check_seen, seen, prepared, 3)
+    seen = torch.rand(2, 3, 16, 17)
+    refused(r"\(H, W\) = \(16, 16\), got \(16, 17\)", view.check_seen, seen, prepared, 3)

@@ -14,13 +14,7 @@ from torch.utils._pytree import tree_leaves
 from darswin import create_model, frames, optimize
 from darswin.deploy import camera
 from darswin.deploy.export import export_program
-from darswin.lens import (
-    BrownConrady,
-    Equidistant,
-    Perspective,
-    Polynomial,
-    Spherical,
-)
+from darswin.lens import BrownConrady, Equidistant, Perspective, Polynomial, Spherical
 from darswin.models import LensAdapter, Swin
 from darswin.views import CameraView, PlainView, PolarView, View, list_views, make_view
 
@@ -41,9 +35,6 @@ def angles(lens, size):
 def smooth(height, width):
     x, y = pixels(height, width)
     return torch.stack((torch.sin(x / 12), torch.cos(y / 12), torch.sin((x + y) / 16)))[None]
-
-
-# -- squares and adapters -----------------------------------------------------------------------
 
 
 def test_a_field_of_view_gives_things_one_size_in_the_square():
@@ -125,9 +116,6 @@ def test_a_view_reaches_as_far_as_the_lens_up_to_its_limit():
         assert_close(view(picture, lens), expected, rtol=0, atol=1e-4)
 
 
-# -- models on views ----------------------------------------------------------------------------
-
-
 @torch.no_grad()
 def test_a_map_coarser_than_the_image_is_resized():
     model = network("swin_unet_nano", image_size=(128, 64), patch_size=8, skip_width=0)
@@ -171,15 +159,10 @@ def test_a_view_may_have_another_size_than_the_images(name):
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    ("name", "view"),
-    [
-        ("darswin_unet_a_nano", None),
-        ("swin_unet_nano", dict(name="perspective", reach=1.5)),
-        ("swin_unet_nano", dict(name="square", fov=3.0)),
-    ],
+    "view", [None, dict(name="perspective", reach=1.5), dict(name="square", fov=3.0)]
 )
-def test_the_head_reads_the_rays_of_its_pixels(name, view):
-    options = dict(view=view) if view else {}
+def test_the_head_reads_the_rays_of_its_pixels(view):
+    name, options = ("swin_unet_nano", dict(view=view)) if view else ("darswin_unet_a_nano", {})
     model, blind = (network(name, rays=rays, **options) for rays in (True, False))
     prepared = model.prepare(WIDE, (64, 64))
     if view:
@@ -201,21 +184,18 @@ def test_the_head_reads_the_rays_of_its_pixels(name, view):
     assert_close(blind(images, WIDE), model(images, WIDE))
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "rays"),
-    [
+def test_distances_read_rays_where_there_are_a_lens_and_convolutions():
+    for name, options, rays in (
         ("darswin_unet_a_nano", dict(task="distance"), True),
         ("darswin_unet_a_nano", {}, False),
         ("darswin_unet_a_nano", dict(task="distance", rays=False), False),
         ("darswin_unet_a_nano", dict(rays=True, skip_width=0), False),
         ("swin_unet_nano", dict(task="distance", rays=True), False),
-    ],
-)
-def test_distances_read_rays_where_there_are_a_lens_and_convolutions(name, options, rays):
-    model = network(name, **options)
-    assert model.reads_rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
-    if model.head.skip_width:
-        assert model.head.stem.in_channels == (6 if rays else 3)
+    ):
+        model = network(name, **options)
+        assert model.reads_rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
+        if model.head.skip_width:
+            assert model.head.stem.in_channels == (6 if rays else 3)
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
@@ -310,8 +290,6 @@ def test_a_dense_model_has_no_answer_where_its_view_shows_nothing(name, task, pa
         assert not result[0, :, ~shown].any()
 
 
-# -- errors -------------------------------------------------------------------------------------
-
 THREE = torch.zeros(3, 3, 40, 40)
 
 
@@ -321,28 +299,19 @@ THREE = torch.zeros(3, 3, 40, 40)
         (lambda: make_view("round", (8, 8)), ValueError, "view must be one of .*, got 'round'"),
         (lambda: make_view("none", (8, 8), fov=1.0), TypeError, "'fov'; it has mean, std"),
         (lambda: make_view("square", (8, 9)), ValueError, r"must be square, got \(8, 9\)"),
-        (lambda: make_view("square", (8, 8), mean=0.5, std=None), ValueError, "given together"),
         (lambda: make_view("square", 8, spacing="tan")(THREE, Equidistant(9.0, 1.7)), ValueError,
          "spacing='tan' needs lenses"),
         (lambda: make_view("mercator", 8, spacing="g"), TypeError,
          "'mercator' has no option 'spacing'; it has fov, theta_max, up,"),
         (lambda: View().prepare(None, (8, 8)), NotImplementedError, ""),
         (lambda: LensAdapter(nn.Identity()), TypeError, "size must be .*, got None"),
-        (lambda: LensAdapter(nn.Identity(), (8, 8, 8)), TypeError, r"size must be .*\(8, 8, 8\)"),
         (lambda: LensAdapter(nn.Identity(), -1), ValueError, "size must be at least 1.*, got"),
-        (lambda: LensAdapter(nn.Identity(), 8, view="round"), ValueError, "view must be one of"),
         (lambda: LensAdapter(nn.Identity(), view=PolarView()), ValueError, "a view of pixels"),
-        (lambda: LensAdapter(nn.Identity(), 8, view=make_view("none", (8, 8))), ValueError,
-         "has its own size"),
         (lambda: LensAdapter(nn.Identity(), 8, view=make_view("none", (8, 8)), mean=0.0),
          ValueError, "has its own size and mean"),
         (lambda: LensAdapter(nn.Identity(), 8, output="maps"), ValueError, "output must be"),
         (lambda: LensAdapter(nn.Identity(), 8)(THREE.byte(), LENSES[:1]), TypeError,
          r"images must be in floating point, got torch\.uint8"),
-        (lambda: LensAdapter(nn.Identity(), 8)(THREE, LENSES), ValueError,
-         "each of the 3 images, got 2"),
-        (lambda: LensAdapter(nn.Identity(), 8)(THREE, None), TypeError,
-         r"lens must be a darswin\.lens\.Lens, got NoneType"),
         (lambda: Swin(view=PolarView()), ValueError, "a view of pixels"),
         (lambda: Swin(image_size=32, view=make_view("mercator", (30, 63))), ValueError,
          r"patch_size must divide .* = \(30, 63\), got 2"),

@@ -207,15 +207,6 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
     assert not found[exact.isnan()].any()
 
 
-@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
-def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
-    lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
-    view = PolarView(4, 8, (1, 1), spacing=spacing)
-    grid = view.grid(lens, (64, 64))
-    around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
-    assert_close(view.token_rays(lens), lens.unproject_points((around + grid.center[0])[None]))
-
-
 # -- samples and their embedding ----------------------------------------------------------------
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -276,16 +267,19 @@ def test_it_jitters_only_in_training_and_by_torchs_generator():
     assert torch.equal(sample(images, LENSES), first) and not torch.equal(first, second)
 
 
-@pytest.mark.parametrize(
-    ("shape", "given", "last"),
-    [((2, 32, 33, 4), None, True), ((2, 1, 32, 3), False, False), ((2, 32, 3, 1), True, True)],
-)
-def test_uint8_images(shape, given, last):
-    images = torch.randint(256, shape, dtype=torch.uint8)
-    planes = images.permute(0, 3, 1, 2) if last else images
+def test_images_of_uint8_and_those_that_do_not_fit():
     sample = PolarView(4, 8, (3, 2), mean=0.4, std=0.2)
-    expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
-    assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+    shapes = ((2, 32, 33, 4), None), ((2, 1, 32, 3), False), ((2, 32, 3, 1), True)
+    for shape, given in shapes:
+        images = torch.randint(256, shape, dtype=torch.uint8)
+        planes = images.permute(0, 3, 1, 2) if given in (None, True) else images
+        expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
+        assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+    refused(r"\(B, C, H, W\), got \(3, 32", sample, torch.zeros(3, 32, 32), LENSES)
+    refused("images must be a tensor, got list", sample, [1], LENSES, error=TypeError)
+    refused("both .* pass channels_", sample, torch.zeros(2, 1, 32, 3).byte(), LENSES)
+    wrong = torch.zeros(2, 1, 9, 9), LENSES, "yes"
+    refused("channels_last must be True", sample, *wrong, error=TypeError)
 
 
 @pytest.mark.slow
@@ -297,16 +291,3 @@ def test_a_calibrated_camera_compiles(lens):
     images, lens = torch.rand(1, 3, 96, 128), lens.resized((96, 128))
     compiled = torch.compile(sample, fullgraph=True, backend="aot_eager")
     assert_close(compiled(images, lens), sample(images, lens))
-
-
-@pytest.mark.parametrize(
-    ("images", "lens", "last", "error", "message"),
-    [
-        (torch.zeros(3, 32, 32), LENSES, None, ValueError, r"\(B, C, H, W\), got \(3, 32"),
-        ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
-        (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
-        (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
-    ],
-)
-def test_images_and_lenses_that_do_not_fit(images, lens, last, error, message):
-    refused(message, PolarView(4, 8, (2, 2)), images, lens, last, error=error)
