@@ -147,10 +147,9 @@ def test_on_a_view_it_is_a_lens_adapter_around_it(view):
 def test_a_view_may_have_another_size_than_the_images(name):
     images = torch.rand(2, 3, 32, 32)
     sizes = dict(view=make_view(name, (16, 40)), image_size=32, patch_size=2, window=(4, 5))
+    sizes |= dict(depths=(1, 1), num_heads=(1, 2))
     for task in ("segmentation", "distance"):
-        model = create_model(
-            "swin_unet_nano", depths=(1, 1), num_heads=(1, 2), task=task, **sizes
-        ).eval()
+        model = create_model("swin_unet_nano", task=task, **sizes).eval()
         assert model(images, LENSES).shape == (2, model.num_classes, 32, 32)
         assert model.sample(images, model.prepare(LENSES, (32, 32))).shape[2:] == (16, 40)
     with pytest.raises(ValueError, match=r"image_size, \(H, W\) = \(32, 32\), got \(16, 40\)"):

@@ -24,9 +24,8 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
     return Spherical.from_fov(torch.tensor(xi, dtype=f64), fov, radius)
 
 
-@pytest.mark.parametrize(
-    ("xi", "spacing", "radii"),
-    [  # the borders of rings 1, 2, 4, 8, 12 and 15 in a 64 px image
+def test_ring_borders_in_pixels():
+    for xi, spacing, radii in (  # the borders of rings 1, 2, 4, 8, 12 and 15 in a 64 px image
         (0.0, "tan", (2, 4, 8, 16, 24, 30)),
         (0.0, "theta", (0.14, 0.29, 0.60, 1.43, 3.29, 10.49)),
         (0.2, "tan", (7.9, 13.4, 20.2, 26.8, 30.1, 31.6)),
@@ -36,14 +35,10 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
         (1.0, "tan", (16.8, 23.2, 27.8, 30.5, 31.5, 31.9)),
         (1.0, "theta", (1.60, 3.20, 6.47, 13.4, 21.6, 29.1)),
         (0.7, "radius", (2, 4, 8, 16, 24, 30)),
-    ],
-)
-def test_ring_borders_in_pixels(xi, spacing, radii):
-    borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders
-    got = borders[0, [1, 2, 4, 8, 12, 15]]
-    assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
-    assert borders[0, 0] == 0
-    assert_close(borders[0, -1], torch.tensor(32.0, dtype=f64))
+    ):
+        borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders[0]
+        expected = torch.tensor((0, *radii, 32), dtype=f64)
+        assert_close(borders[[0, 1, 2, 4, 8, 12, 15, 16]], expected, rtol=0, atol=0.06)
 
 
 @pytest.mark.parametrize(
@@ -117,9 +112,8 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
     assert torch.autograd.gradcheck(radii, (xi, focal, theta_max))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_wrong_settings():
+    for change, message in (
         (dict(rings=0), "rings must be an int of at least 1, got 0"),
         (dict(sectors=2.0), "sectors must be an int"),
         (dict(samples=(0, 3)), r"samples must be \(S_r, S_φ\)"),
@@ -133,16 +127,8 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
         (dict(theta_max=1.0, sample_spacing="tan"), "needs spacing='theta', got 'tan'"),
         (dict(jitter=2.0), "jitter"),
         (dict(layout="rows"), "layout"),
-    ],
-)
-def test_wrong_settings(change, message):
-    refused(message, PolarView, **SIZES | change)
-
-
-def camera(**aside):
-    """A camera with the numbers of tests/lens/files/kitti360_02.yaml, to 95°."""
-    return Mei(torch.tensor([2.35], dtype=f64), 1390.0, [0.032, 2.4], math.radians(95),
-               [708.5, 697.0], **aside)  # fmt: skip
+    ):
+        refused(message, PolarView, **(SIZES | change))
 
 
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
@@ -156,7 +142,8 @@ def camera(**aside):
     ],
 )
 def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
-    lens = camera(**aside)
+    xi = torch.tensor([2.35], dtype=f64)  # as in tests/lens/files/kitti360_02.yaml, to 95°
+    lens = Mei(xi, 1390.0, [0.032, 2.4], math.radians(95), [708.5, 697.0], **aside)
     grid = PolarView(**SIZES, spacing=spacing).grid(lens, (1400, 1400))
     around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
     matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
