@@ -91,9 +91,8 @@ def smooth():
 
 def by_loops(remap, supersampling=1):
     """The points of the picture that the pixels of a view show, (k·H', k·W', 2), from rays."""
-    y, x = (
-        (np.arange(side * supersampling) + 0.5) / supersampling - 0.5 for side in remap.view_size
-    )
+    sides = (side * supersampling for side in remap.view_size)
+    y, x = ((np.arange(side) + 0.5) / supersampling - 0.5 for side in sides)
     grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
     if isinstance(remap.view, CropView) or not remap.view.uses_lens:
         return remap.view.to_image(grid, remap.lens, remap.size)[0].numpy()
