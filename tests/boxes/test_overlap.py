@@ -82,9 +82,8 @@ def any_boxes(most):
 
 
 def upright_boxes(most):
-    corners = st.integers(0, most).flatmap(
-        lambda n: arrays(np.int64, (n, 4), elements=st.integers(0, 12))
-    )
+    shapes = st.tuples(st.integers(0, most), st.just(4))
+    corners = arrays(np.int64, shapes, elements=st.integers(0, 12))
     return corners.map(lambda rows: np.concatenate((rows[:, :2], rows[:, :2] + rows[:, 2:]), 1))
 
 

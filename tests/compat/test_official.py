@@ -69,9 +69,8 @@ def test_logits_equal_with_any_maths_library(name):
 
 
 def test_the_radial_models_weights_load_with_a_warning():
-    donor = DarSwin(
-        10, 3, 8, (2, 2, 2, 2), (1, 2, 4, 8), variant="RA", position_bias="polar", harmonics=4
-    )
+    options = dict(variant="RA", position_bias="polar", harmonics=4)
+    donor = DarSwin(10, 3, 8, (2, 2, 2, 2), (1, 2, 4, 8), **options)
     names = {"b_theta": "a_r", "a_theta": "b_r", "b_phi": "a_p", "a_phi": "b_p"}
     state = {}
     for key, value in donor.state_dict().items():

@@ -50,12 +50,8 @@ def test_the_limit_is_where_r_stops_rising(name):
 def test_models_that_contain_each_other():
     xi, f, k, none = double(1.7), double(300.0), double(0.01, -0.002), double(0.0)
     alpha, spherical, pinhole = xi / (1 + xi), Spherical(xi, 1000.0), Perspective(f)
-    of_spheres = [
-        Mei(xi, 1000.0),
-        EnhancedUnified(alpha, 1.0, 1000 * (1 - alpha)),
-        DoubleSphere(none, alpha, 1000 * (1 - alpha)),
-        DoubleSphere(xi, 0.0, 1000.0),
-    ]
+    focal, of_spheres = 1000 * (1 - alpha), [Mei(xi, 1000.0), DoubleSphere(xi, 0.0, 1000.0)]
+    of_spheres += [EnhancedUnified(alpha, 1.0, focal), DoubleSphere(none, alpha, focal)]
     for lens in of_spheres:
         assert_close(lens.theta_limit, spherical.theta_limit, rtol=0, atol=3e-6)
     theta = torch.linspace(0.01, 1.4, 50, dtype=f64)

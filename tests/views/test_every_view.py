@@ -56,12 +56,11 @@ OPTIONS = {
 }
 OTHER = Spherical.from_fov(0.5, 2.2, 30.0, center=[29.5, 31.0], image_size=(64, 60))
 SHEARED = KannalaBrandt(25.0, [0.02], 1.1, affine=[[1, 0.1], [0, 0.9]], image_size=(50, 60))
+FLAT = Perspective(25.0, image_size=(50, 60))
 MADE = {
     "camera": lambda **options: CameraView(OTHER, turn=Turn(0.4, True), **options),
     "camera of another kind": lambda **options: CameraView(SHEARED, **options),
-    "camera up to 90°": lambda **options: CameraView(
-        Perspective(25.0, image_size=(50, 60)), **options
-    ),
+    "camera up to 90°": lambda **options: CameraView(FLAT, **options),
     "crop": lambda **_: CropView((10, 20, 71, 83), (34, 45)),
     "turned crop": lambda **_: CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
 }
@@ -360,6 +359,7 @@ def convolution():
 
 
 UNET = dict(image_size=32, patch_size=2, window=(2, 2), task="distance", rays=True)
+CONV = dict(widths=(4, 6), size=32, task="distance")
 SWIN = dict(depths=(1, 1), num_heads=(1, 2), embed_dim=8, image_size=32)
 # Networks on a view of 32 × 32 px, by its name.
 NETWORKS = {
@@ -368,9 +368,7 @@ NETWORKS = {
     "Swin": lambda view: Swin(4, view=view, **SWIN),
     "Unet": lambda view: create_model("swin_unet_nano", view=view, **UNET),
     "Unet of tokens": lambda view: create_model("swin_unet_nano", view=view, skip_width=0, **UNET),
-    "Unet of convolutions": lambda view: create_model(
-        "conv_unet_nano", widths=(4, 6), view=view, size=32, task="distance"
-    ),
+    "Unet of convolutions": lambda view: create_model("conv_unet_nano", view=view, **CONV),
 }
 DTYPES = (torch.float32, torch.bfloat16, torch.float64)
 
