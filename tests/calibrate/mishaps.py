@@ -89,13 +89,7 @@ def again(poses: list[int], times: int, jitter: float = 1e-4):
     return change
 
 
-def parallel(
-    tilt: float,
-    nearest: float = 0.2,
-    farthest: float = 0.5,
-    spread: float = 0.3,
-    noise: float = 0.1,
-):
+def parallel(tilt: float, nearest=0.2, farthest=0.5, spread=0.3, noise=0.1):
     """Boards that are parallel to the sensor, up to a tilt in degrees."""
 
     def change(true: Rig, g) -> Given:
@@ -262,12 +256,9 @@ def case(name: str, fov: float, seed: int) -> tuple[Rig, Given]:
     true = rig(true_lens("KannalaBrandt", fov, seed=seed), 15, noise=0.1, seed=seed)
     given = MISHAPS[name](true, torch.Generator().manual_seed(seed))
     if "square" in name and "pixels" in name:
-        true = true._replace(
-            lens=true.lens.replace(
-                affine=torch.tensor([[[1, 0], [0, 1.01]]], dtype=f64),
-                center=true.lens.center + torch.tensor([0, 0.01]) * (true.lens.center - 480),
-            )
-        )
+        affine = torch.tensor([[[1, 0], [0, 1.01]]], dtype=f64)
+        center = true.lens.center + torch.tensor([0, 0.01]) * (true.lens.center - 480)
+        true = true._replace(lens=true.lens.replace(affine=affine, center=center))
     return true, given._replace(corners=shown(given.corners))
 
 

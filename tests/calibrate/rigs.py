@@ -39,17 +39,13 @@ def board(columns: int = 9, rows: int = 6, square: float = 0.03) -> Tensor:
     return square * torch.stack((x, y), -1).reshape(-1, 2).to(f64)
 
 
-def true_lens(
-    model: str, fov: float, size: tuple[int, int] = (960, 1000), seed: int = 0, shift: float = 0.1
-) -> Lens:
+def true_lens(model: str, fov: float, size=(960, 1000), seed=0, shift=0.1) -> Lens:
     """A lens of a model whose field of view (degrees) fills the image's shorter side, with its
     principal point off the middle by up to a part `shift` of the side."""
     generator = torch.Generator().manual_seed(seed)
     alpha, beta, x, y = torch.rand(4, generator=generator, dtype=f64).tolist()
-    base = EnhancedUnified.from_fov(
-        torch.tensor([0.4 + 0.2 * alpha], dtype=f64), 0.9 + 0.4 * beta, math.radians(fov),
-        min(size) / 2,
-    )  # fmt: skip
+    alpha, beta = torch.tensor([0.4 + 0.2 * alpha], dtype=f64), 0.9 + 0.4 * beta
+    base = EnhancedUnified.from_fov(alpha, beta, math.radians(fov), min(size) / 2)
     lens = fit(MODELS["Polynomial" if model == "OCamInverse" else model], base).lens
     if model == "OCamInverse":  # of a fit, r(0) is not 0
         shifted = Polynomial([0, *lens.coefficients[0].tolist()])(Polynomial([math.pi / 2, 1]))
@@ -72,18 +68,9 @@ def turn(vector: Tensor) -> Tensor:
     )
 
 
-def rig(
-    lens: Lens,
-    pictures: int = 20,
-    points: Tensor | None = None,
-    *,
-    noise: float = 0.2,
-    seed: int = 0,
-    tilt: float = 45.0,
-    least: int = 12,
-) -> Rig:
-    """Boards at random places of the whole field of view, turned to the camera up to `tilt`,
-    degrees. Each picture shows at least `least` corners."""
+def rig(lens: Lens, pictures=20, points=None, *, noise=0.2, seed=0, least=12) -> Rig:
+    """Boards at random places of the whole field of view, turned to the camera up to 45°. Each
+    picture shows at least `least` corners."""
     points = board() if points is None else points
     generator = torch.Generator().manual_seed(seed)
     height, width = (round(side) for side in lens.image_size[0].tolist())
@@ -98,7 +85,7 @@ def rig(
         ray = vector_of(theta, direction)
         # As seen along the ray, x of the board is to the right.
         facing = turn(theta * torch.stack((-direction[1], direction[0], 0 * theta)))
-        lean = math.radians(tilt) * u[2].sqrt() * torch.stack(
+        lean = math.radians(45) * u[2].sqrt() * torch.stack(
             (torch.cos(2 * math.pi * u[3]), torch.sin(2 * math.pi * u[3]), 0 * theta)
         )  # fmt: skip
         spin = (u[4] - 0.5) * torch.stack((0 * theta, 0 * theta, 1 + 0 * theta))
@@ -120,10 +107,8 @@ def ray_errors(found: Lens, true: Lens, best: bool = False) -> Tensor:
     """Degrees between the rays of two lenses at pixels over the picture that the true lens sees;
     `best`: after the rotation that makes them smallest."""
     height, width = (round(side) for side in true.image_size[0].tolist())
-    y, x = torch.meshgrid(
-        torch.linspace(0, height - 1, 41, dtype=f64), torch.linspace(0, width - 1, 41, dtype=f64),
-        indexing="ij",
-    )  # fmt: skip
+    sides = (torch.linspace(0, side - 1, 41, dtype=f64) for side in (height, width))
+    y, x = torch.meshgrid(*sides, indexing="ij")
     pixels = torch.stack((x, y), -1).reshape(-1, 2)
     wanted = true.unproject_points(pixels)
     seen = ~wanted.isnan().any(-1)

@@ -6,19 +6,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-import torch
-from calibrate_boards import Pose, Renderer
+from calibrate_boards import Renderer
 from helpers import refused, slow_but
 
-from darswin.calibrate import Board, find_corners
-from darswin.calibrate.boards import (
-    _refined,
-    _unlike,
-    edge_width,
-    pixels_per_unit,
-    shown_instead,
-    wrong,
-)
+from darswin.calibrate import Board, boards, find_corners
+from darswin.calibrate.boards import edge_width, pixels_per_unit, shown_instead, wrong
 from darswin.calibrate.circle import image_circle
 from darswin.lens import Equidistant, Lens, Perspective
 
@@ -87,8 +79,7 @@ def test_a_board_with_markers_keeps_its_numbers_if_seen_in_part_and_is_never_mir
     assert np.isnan(find_corners(picture[:, ::-1], board)).all()
 
 
-@pytest.mark.parametrize("upside_down", [False, True])
-def test_grids_of_kalibr_are_read(upside_down):
+def test_grids_of_kalibr_are_read():
     """A grid as Kalibr draws it: a border of two bits, and tag 0 at the lower left."""
     tag, gap, columns, rows = 60, 18, 4, 3
     board = Board.april_grid(columns, rows, float(tag), float(gap))
@@ -99,11 +90,11 @@ def test_grids_of_kalibr_are_read(upside_down):
         drawn = cv2.aruco.generateImageMarker(markers, number, tag, borderBits=2)
         picture[y : y + tag, x : x + tag] = drawn
     true = board.points + 29.5
-    if upside_down:
-        picture = np.ascontiguousarray(picture[::-1, ::-1])
-        true = np.array(picture.shape[::-1]) - 1 - true
     picture = cv2.GaussianBlur(picture, (0, 0), 0.7)
     np.testing.assert_allclose(find_corners(picture, board), true, atol=0.5)
+    turned = np.array(picture.shape[::-1]) - 1 - true
+    picture = np.ascontiguousarray(picture[::-1, ::-1])  # upside down
+    np.testing.assert_allclose(find_corners(picture, board), turned, atol=0.5)
 
 
 def test_grids_may_begin_with_another_tag():
@@ -130,19 +121,18 @@ def test_corners_between_slanted_squares_are_where_edges_cross_or_not_found():
     grid = true.reshape(4, 5, 2)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.8)
     start = grid + np.random.default_rng(0).uniform(-1, 1, grid.shape)
-    np.testing.assert_allclose(_refined(picture, start, board), grid, atol=0.2)
+    np.testing.assert_allclose(boards._refined(picture, start, board), grid, atol=0.2)
     # On an edge beside a corner, opposite sides are unlike.
     start[1, 2] += 0.3 * (grid[1, 3] - grid[1, 2])
-    found = _refined(picture, start, board)
+    found = boards._refined(picture, start, board)
     assert np.isnan(found[1, 2]).all() or np.linalg.norm(found - grid, axis=-1)[1, 2] < 0.2
     radius = np.full((4, 5), 5.0)
-    assert _unlike(picture, grid, radius).max() < 0.15
+    assert boards._unlike(picture, grid, radius).max() < 0.15
     moved = grid + 0.25 * (grid[1, 3] - grid[1, 2])
-    assert _unlike(picture, moved, radius).min() > 0.3
+    assert boards._unlike(picture, moved, radius).min() > 0.3
 
 
-@pytest.mark.parametrize("rows", [5, 6])
-@pytest.mark.parametrize("white_first", [False, True])
+@pytest.mark.parametrize(("rows", "white_first"), [(5, False), (5, True), (6, False), (6, True)])
 def test_charuco_boards_may_begin_with_a_white_square(rows, white_first):
     drawn = cv2.aruco.CharucoBoard((7, rows), 1.0, 0.7, cv2.aruco.getPredefinedDictionary(2))
     drawn.setLegacyPattern(white_first)
@@ -206,35 +196,30 @@ def test_a_wrong_order_is_noticed(one, change):
 
 @pytest.mark.parametrize("fov", [60, 150, 250])
 def test_true_corners_are_never_wrong(fov):
-    view = camera(fov)
     for name, board in BOARDS.items():
-        for pose in view.poses(board, 4, np.random.default_rng(2)):
-            grid = view.corners(board, pose).reshape(board.rows, board.columns, 2)
+        for pose in camera(fov).poses(board, 4, np.random.default_rng(2)):
+            grid = camera(fov).corners(board, pose).reshape(board.rows, board.columns, 2)
             assert not wrong(grid, board).any(), name
 
 
 def test_points_are_in_the_unit_of_the_square():
-    expected = [[0, 0], [2, 0], [4, 0], [0, 2], [2, 2], [4, 2]]
+    expected = [[x, y] for y in (0, 2) for x in (0, 2, 4)]
     np.testing.assert_array_equal(Board.chessboard(3, 3, 2.0).points[:6], expected)
     np.testing.assert_array_equal(Board.charuco(4, 3, 2.0, 1.0).points, expected)
-    grid = Board.april_grid(2, 1, 2.0, 0.5).points
-    x = [0, 2, 2.5, 4.5]
-    np.testing.assert_array_equal(grid, [[a, b] for b in (0, 2) for a in x])
+    expected = [[x, y] for y in (0, 2) for x in (0, 2, 2.5, 4.5)]
+    np.testing.assert_array_equal(Board.april_grid(2, 1, 2.0, 0.5).points, expected)
 
 
 @pytest.mark.parametrize(("make", "error", "said"), [
     (lambda: Board.chessboard(1, 6, 0.1), ValueError, "`columns` must be from 3 to 100, got 1"),
     (lambda: Board.chessboard(9, 6.0, 0.1), TypeError, "`rows` must be a whole number"),
     (lambda: Board.chessboard(9, 6, 0.0), ValueError, "`square` must be positive, got 0"),
-    (lambda: Board.chessboard(9, 6, math.nan), ValueError, "`square` must be positive"),
     (lambda: Board.charuco(9, 6, 0.1, 0.1), ValueError, "`marker` must be below the square"),
     (lambda: Board.charuco(9, 6, 0.1, 0.05, "4X4_5"), ValueError, "did you mean 4X4_50"),
     (lambda: Board.charuco(20, 20, 0.1, 0.05, "4X4_50"), ValueError, "200 markers or more"),
-    (lambda: Board.april_grid(6, 6, 0.1, 0.0), ValueError, "`gap` must be positive"),
     (lambda: Board.april_grid(6, 6, 0.1, 0.1, first_tag=-1), ValueError, "`first_tag` must be 0"),
     (lambda: Board.april_grid(6, 6, 0.1, 0.1, first_tag=560), ValueError, "596 markers or more"),
     (lambda: find_corners(np.zeros((9, 9)), CHESSBOARD), TypeError, "array of uint8"),
-    (lambda: find_corners([1], CHESSBOARD), TypeError, "array of uint8"),
     (lambda: find_corners(np.zeros((9, 9, 4), np.uint8), CHESSBOARD), ValueError,
      r"\(H, W, 3\), got \(9, 9, 4\)"),
 ])  # fmt: skip
@@ -255,19 +240,15 @@ def test_the_image_circle_is_that_of_the_lens(size):
     np.testing.assert_allclose(image_circle(dark), (x, y, 205), atol=2.5)
 
 
-def test_a_circle_that_is_cut_and_dented_is_found():
+def test_a_circle_that_is_cut_and_dented_is_found_and_none_where_none_is():
     y, x = np.mgrid[:480, :748]
     picture = np.where(np.hypot(x - 380.0, y - 236.0) < 290, 220, 6).astype(np.uint8)
     picture[100:300, 90:130] = picture[330:420, 600:700] = picture[430:480, 250:560] = 8
     np.testing.assert_allclose(image_circle([picture]), (380, 236, 290), atol=1.5)
-
-
-def test_pictures_without_a_circle_have_none():
-    assert image_circle([next(shots(camera(80), CHESSBOARD, seed=0))[0]]) is None
     framed = np.zeros((300, 400), np.uint8)
-    assert image_circle([framed]) is None
     framed[40:-40, 40:-40] = 120
-    assert image_circle([framed]) is None
+    for picture in (next(shots(camera(80), CHESSBOARD, seed=0))[0], framed, 0 * framed):
+        assert image_circle([picture]) is None
 
 
 def test_edges_are_as_wide_as_their_blur():
@@ -276,25 +257,6 @@ def test_edges_are_as_wide_as_their_blur():
         view = camera(90, (360, 360), blur=blur, noise=0.5)
         widths.append(edge_width(*next(shots(view, CHESSBOARD, seed=4)), CHESSBOARD))
     assert 1.4 < widths[0] < 2.2 and 2.3 < widths[1] < 3.3 and widths[2] > 3.8
-
-
-def test_the_renderer_follows_rays_behind_the_camera():
-    """A board at 105° from the axis is seen, from its front only, and the mean of a square is its
-    own light."""
-    view, rng = camera(240, noise=0.0, vignette=0.0, blur=0.0), np.random.default_rng(0)
-    angle = math.radians(105)
-    ray = np.array([math.sin(angle), 0.0, math.cos(angle)])
-    facing = np.stack((np.cross([0.0, 1.0, 0.0], ray), [0.0, 1.0, 0.0], ray), 1)
-    pose = Pose(facing, 0.4 * ray - facing[:, :2] @ CHESSBOARD.points.mean(0))
-    picture, corners = view.picture(CHESSBOARD, pose, rng), view.corners(CHESSBOARD, pose)
-    theta = view.lens.unproject_pixels(torch.from_numpy(corners)[None])[0]
-    assert theta.min() > math.radians(85) and theta.max() > math.radians(115)
-    cells = corners.reshape(6, 9, 2)
-    x, y = ((cells[1:, 1:] + cells[:-1, :-1]) / 2).round().astype(int).reshape(-1, 2).T
-    assert set(np.unique(picture[y, x])) == {15, 230}
-    back = Pose(facing @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
-    assert not np.isin(picture, [15, 230]).all()
-    assert not np.isin(view.picture(CHESSBOARD, back, rng), [15, 230]).any()
 
 
 @pytest.mark.parametrize("board", [Board.chessboard(5, 4, 0.5), Board.april_grid(2, 2, 1.0, 0.3)])
@@ -311,15 +273,13 @@ def test_pixels_per_unit_are_those_to_the_nearest_neighbour(board):
     np.testing.assert_allclose(pixels_per_unit(grid, board), least)
 
 
-@pytest.mark.parametrize(
-    "size", [(0, 0), (0, 9), (1, 1), (3, 3), (40, 2), (15, 15), (16, 16), (17, 90)]
-)
-def test_small_pictures_show_nothing(size):
-    picture = np.random.default_rng(1).integers(0, 256, size).astype(np.uint8)
+def test_small_pictures_show_nothing():
     small = Board.chessboard(3, 3, 1.0), Board.charuco(4, 3, 1.0, 0.5)
-    for board in (*small, Board.april_grid(1, 1, 1.0, 0.3)):
-        assert np.isnan(find_corners(picture, board)).all()
-    assert image_circle([picture]) is None and image_circle([0 * picture]) is None
+    for size in ((0, 0), (0, 9), (1, 1), (3, 3), (40, 2), (15, 15), (16, 16), (17, 90)):
+        picture = np.random.default_rng(1).integers(0, 256, size).astype(np.uint8)
+        for board in (*small, Board.april_grid(1, 1, 1.0, 0.3)):
+            assert np.isnan(find_corners(picture, board)).all()
+        assert image_circle([picture]) is None and image_circle([0 * picture]) is None
 
 
 @pytest.mark.slow

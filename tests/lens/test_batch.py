@@ -93,16 +93,13 @@ def test_the_same_numbers_are_the_same_lens_and_merge():
     assert len(lens[:0].merged()) == 0 and lens[1].merged().same_as(lens[1])
 
 
-def test_principal_point():
-    lens = Spherical(0.1, 10.0, 1.0)
-    assert lens.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
-    assert Spherical(0.1, 10.0, 1.0, center=[3.0, 4.0]).center_in((5, 8)).tolist() == [[3.0, 4.0]]
-    refused("needs the image_size", lens.cropped, 0, 0, 10, 10)
-    refused("needs a lens that has an image_size", lens.resized, (3, 4))
-
-
 def test_resized_and_cropped_take_any_number_and_nothing_that_is_no_image():
+    bare = Spherical(0.1, 10.0, 1.0)
+    assert bare.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
+    refused("needs the image_size", bare.cropped, 0, 0, 10, 10)
+    refused("needs a lens that has an image_size", bare.resized, (3, 4))
     lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
+    assert lens.center_in((5, 8)).tolist() == [[319.5, 241.5]]
     whole = lens.resized(0.5)
     for half in (np.float32(0.5), np.float64(0.5), torch.tensor(0.5), np.array(0.5)):
         resized = lens.resized(half)

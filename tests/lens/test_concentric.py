@@ -68,34 +68,26 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-@pytest.mark.parametrize("spacing", ["theta", "tan", "radius"])  # g: `test_there_and_back`
-def test_the_pixels_of_the_square_are_where_their_rays_land(name, spacing):
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_the_pixels_of_the_square_are_where_their_rays_land_and_back(name, spacing):
     lens, size = EXAMPLES[name]
     if spacing == "tan":
         lens = lens.with_theta_max(1.3)
-    view = square_view(lens, size, 9, spacing)
     steps = (2 * torch.arange(9, dtype=f64) + 1) / 9 - 1
     r, phi = torch.tensor([[published(a, b) for a in steps] for b in steps], dtype=f64).unbind(-1)
     last = lens.theta_max[:, None, None]
-    theta = {
+    theta_of = {
         "theta": lambda: r * last,
         "tan": lambda: torch.atan(r * torch.tan(last)),
         "radius": lambda: lens.unproject(r * lens.project(last)),
-    }[spacing]()
-    assert_close(view, lens.project_rays(theta, phi[None], size), atol=1e-7, rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_there_and_back(name, spacing):
-    lens, size = EXAMPLES[name]
-    if spacing == "tan":
-        lens = lens.with_theta_max(1.3)
+    }
+    if spacing in theta_of:
+        expected = lens.project_rays(theta_of[spacing](), phi[None], size)
+        assert_close(square_view(lens, size, 9, spacing), expected, atol=1e-7, rtol=1e-9)
     places = square_points(lens, size, spacing)
     beyond = (places == OUTSIDE).all(-1)
-    theta, azimuth = lens.unproject_pixels(
-        torch.stack(torch.meshgrid(*(torch.arange(s, dtype=f64) for s in size[::-1]),
-                                   indexing="xy"), -1)[None], size)  # fmt: skip
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=f64) for side in size), indexing="ij")
+    theta, azimuth = lens.unproject_pixels(torch.stack((x, y), -1)[None], size)
     assert torch.equal(beyond, ~lens.sees(theta))
     assert (places[~beyond].abs() <= 1).all()
     # The directions at the places of the image's pixels are those of the image's rays.
@@ -104,7 +96,7 @@ def test_there_and_back(name, spacing):
     same = torch.cos(apart[~beyond & (radius > 1e-3)])
     assert torch.allclose(same, torch.ones((), dtype=f64))
     if spacing == "theta":
-        share = (theta / lens.theta_max[:, None, None])[~beyond]
+        share = (theta / last)[~beyond]
         assert_close(radius[~beyond], share.clamp(max=1), atol=1e-7, rtol=1e-7)
 
 

@@ -4,7 +4,6 @@ import codecs
 import contextlib
 import io
 import random
-import zipfile
 from itertools import product
 
 import cv2
@@ -102,9 +101,6 @@ def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
             load(path)
         except ValueError as error:
             assert str(path) in str(error) and "\n" not in str(error)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("readme.txt", "no array")
-    refused(r"calib\.npz: it is a zip archive, but must be a cal", load, path)
 
 
 def test_arrays_of_objects_are_named(tmp_path):
@@ -131,7 +127,8 @@ def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
     for bad in (6, 8):
         rows[bad] = rows[bad].replace("310", "1e-300")
     path.write_text("".join(rows))
-    refused(r"COLMAP calibration .*: camera '6': ", load_all, path)
+    with few_calls(1_000_000):
+        refused(r"COLMAP calibration .*: camera '6': ", load_all, path)
     assert load(path, camera="5").focal.item() == 305
 
 

@@ -89,10 +89,8 @@ def test_slopes_of_a_table_are_used_and_checked():
     slopes = 200 / torch.cos(angles / 2) ** 2
     lens = Tabulated(angles, exact.project(angles), slopes=slopes)
     theta = torch.linspace(0, 1.5, 1001, dtype=f64)
-    error, usual = (
-        (made.project(theta) - exact.project(theta)).abs().max()
-        for made in (lens, Tabulated(angles, exact.project(angles)))
-    )
+    made = lens, Tabulated(angles, exact.project(angles))
+    error, usual = ((of.project(theta) - exact.project(theta)).abs().max() for of in made)
     assert error < 1e-5 < 1e-3 < usual
     torch.testing.assert_close(lens.resized(2).project(theta), 2 * lens.project(theta))
     straight = dict(angles=[0.0, 1.0, 2.0], radii=[0.0, 10.0, 20.0])

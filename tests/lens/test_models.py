@@ -50,12 +50,8 @@ def test_the_limit_is_where_r_stops_rising(name):
 def test_models_that_contain_each_other():
     xi, f, k, none = double(1.7), double(300.0), double(0.01, -0.002), double(0.0)
     alpha, spherical, pinhole = xi / (1 + xi), Spherical(xi, 1000.0), Perspective(f)
-    of_spheres = [
-        Mei(xi, 1000.0),
-        EnhancedUnified(alpha, 1.0, 1000 * (1 - alpha)),
-        DoubleSphere(none, alpha, 1000 * (1 - alpha)),
-        DoubleSphere(xi, 0.0, 1000.0),
-    ]
+    focal, of_spheres = 1000 * (1 - alpha), [Mei(xi, 1000.0), DoubleSphere(xi, 0.0, 1000.0)]
+    of_spheres += [EnhancedUnified(alpha, 1.0, focal), DoubleSphere(none, alpha, focal)]
     for lens in of_spheres:
         assert_close(lens.theta_limit, spherical.theta_limit, rtol=0, atol=3e-6)
     theta = torch.linspace(0.01, 1.4, 50, dtype=f64)
@@ -155,15 +151,11 @@ def test_gradients_of_points():
 # What is made of wrong arguments, and the words of its error.
 OUT_OF_RANGE = (
     (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
-    (lambda: Perspective(math.inf, 1.0), "focal must be"),
     (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be at most 1.570795 rad"),
     (lambda: Perspective(1.0, 0.0), "theta_max must be finite and above 0"),
-    (lambda: Perspective(1.0, math.nan), "theta_max must be"),
     (lambda: Spherical(-0.1, 1.0, 1.0), "xi must be finite and at least 0, got -0.1"),
-    (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
     (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57"),
     (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be at most 2.09"),
-    (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be at most 2.09"),
     (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
     (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "got -0.2"),
     (lambda: Spherical([[0.1]], 1.0, 1.0), "xi must be a number or (N,)"),
@@ -171,7 +163,6 @@ OUT_OF_RANGE = (
     (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
     (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
     (lambda: FieldOfView(math.pi, 1.0), "omega must be in (0, 3.14159)"),
-    (lambda: FieldOfView(0.0, 1.0), "omega must be in (0, 3.14159)"),
     (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
     (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999"),
     (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
@@ -179,7 +170,6 @@ OUT_OF_RANGE = (
     (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
     (lambda: Polynomial(1.0, 1.0), "coefficients must be (K) or (N, K)"),
     (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
-    (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
     (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), "tangential must be (2) or"),
     (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), "prism must be (4) or"),
     (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734"),
@@ -187,7 +177,6 @@ OUT_OF_RANGE = (
     (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
     (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
     (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be (2) or"),
-    (lambda: Perspective(1.0, 1.0, center=3.0), "center must be"),
     (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
     (lambda: Equidistant(1.0, affine=[1.0, 2.0]), "affine must be (2, 2) or (N, 2, 2)"),
     (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
@@ -199,12 +188,10 @@ OUT_OF_RANGE = (
 )  # fmt: skip
 OF_WRONG_TYPES = (
     (lambda: Perspective("wide", 1.0), "focal must be a number or a tensor, got 'wide'"),
-    (lambda: Spherical(object(), 1.0, 1.0), "xi must be a number"),
     (lambda: Spherical(0.5, 1.0, thetamax=1.0), "thetamax"),
     (lambda: Spherical.from_fov(2.0, 30.0), "'radius'"),
     (lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0), "too many positional"),
     (lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5), "multiple values"),
-    (lambda: Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0), "'focal'"),
 )  # fmt: skip
 
 
@@ -254,15 +241,6 @@ def test_angles_at_the_sides_of_the_image():
     # For an image larger than the image circle, the angle is the limit.
     small = Spherical(2.0, 10.0, image_size=(100, 8))
     assert small.side_angles()[0].tolist()[1] == small.theta_limit.item()
-
-
-def test_spherical_has_the_papers_focal_lengths():
-    # The circle fills a 64 px image at a field of view of 174.63° (released data).
-    xi = double(0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 0.93, 1.0)
-    lens = Spherical.from_fov(xi, 3.0479112779, 32.0)
-    expected = double(1.5, 3.102, 7.907, 12.712, 17.518, 23.925, 31.293, 33.535)
-    assert_close(lens.focal, expected, rtol=0, atol=1e-3)
-    assert_close(lens.r_max, torch.full((8,), 32.0, dtype=f64))
 
 
 @pytest.mark.parametrize("name", [name for name, m in MODELS.items() if issubclass(m, FocalLens)])

@@ -68,7 +68,7 @@ def test_a_whole_circle_sums_up_to_the_cap(theta_max):
         assert total == pytest.approx(2 * math.pi * (1 - math.cos(theta_max)), rel=3e-3)
 
 
-def test_float32_and_batches():
+def test_float32_batches_and_wrong_maps():
     lens, distance = Spherical([0.2, 0.9], 20.0, 1.2), torch.rand(2, 30, 40)
     with_channel = distance_to_z(distance[:, None], lens)
     assert torch.equal(with_channel, distance_to_z(distance, lens)[:, None])
@@ -78,6 +78,10 @@ def test_float32_and_batches():
         exact = solid_angles(lens[k].to(f64), (40, 48))[0]
         torch.testing.assert_close(found[k].double(), exact, rtol=1e-5, atol=0)
     assert solid_angles(lens[:0], (40, 48)).shape == (0, 40, 48)
+    said = r"\(N, H, W\) or \(N, 1, H, W\), got \(2, 3, 4, 4\)"
+    refused(said, distance_to_z, torch.ones(2, 3, 4, 4), lens)
+    refused("2 lenses for 3 maps", z_to_distance, torch.ones(3, 4, 4), lens)
+    refused("tensor, got float", distance_to_z, 1.0, lens, error=TypeError)
 
 
 @pytest.mark.parametrize("name", ["KannalaBrandt", "Mei"])
@@ -125,11 +129,3 @@ def test_what_is_not_known_stays_so():
     few, lens = torch.rand(1, 7, 7, dtype=f64).add(0.5).requires_grad_(), lens.with_theta_max(1.4)
     assert torch.autograd.gradcheck(lambda d: distance_to_z(d, lens), few)
     assert torch.autograd.gradcheck(lambda z: z_to_distance(z, lens), few)
-
-
-def test_wrong_maps_are_named():
-    lens = Equidistant([3.0, 4.0], 1.4)
-    said = r"\(N, H, W\) or \(N, 1, H, W\), got \(2, 3, 4, 4\)"
-    refused(said, distance_to_z, torch.ones(2, 3, 4, 4), lens)
-    refused("2 lenses for 3 maps", z_to_distance, torch.ones(3, 4, 4), lens)
-    refused("tensor, got float", distance_to_z, 1.0, lens, error=TypeError)

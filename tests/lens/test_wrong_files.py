@@ -32,7 +32,6 @@ CHANGED = {
     "woodscape.json": ("WoodScape", (
         ('"k2": -17.5', '"k2": "abc"', "intrinsic.k2 must be a finite number, got 'abc'"),
         ('"k2": -17.5,', "", "string: intrinsic.k2 is missing"),
-        ('"model": "radial_poly",', "", "intrinsic.model is missing"),
         ("350.4", "0.0035", "intrinsic.k1 must be in pixels"),
         ("radial_poly", "kb", "must be one of radial_poly, got 'kb'"),
         ("966.0", "966.5", "intrinsic.height must be a whole number of pixels"),
@@ -62,7 +61,6 @@ CHANGED = {
     "kalibr_ds.yaml": ("Kalibr", (
         ("  intrinsics: [-0.21350274, ", "  intrinsics: [", "cam0.intrinsics must be 6 finite"),
         ("distortion_model: none", "distortion_model: radtan", "must be one of none"),
-        ("  distortion_model: none\n", "", "distortion_model is missing"),
         ("camera_model: ds", "camera_model: dss", "must be one of pinhole, omni, ds, eucm, got"),
         ("331.24405", "-3", "cam0.intrinsics[2] must be a focal length above 0"),
         ("1080]", "abc]", "cam0.resolution[1] must be a whole number"),
@@ -77,7 +75,6 @@ CHANGED = {
     "opencv_fisheye.yaml": ("OpenCV", (
         ("4.2134e+02, ", "-1, ", "camera_matrix must be [fx, skew, cx"),
         ("fisheye_model: 1", "fisheye_model: 7", "must be 0 or 1, got"),
-        ("image_height: 960", "", "image_height is missing"),
         ("image_width: 1280", "", "image_width is missing"),
     )),
     "opencv_omnidir.xml": ("OpenCV", (("1.2345", "abc", "'abc'"),)),
@@ -90,15 +87,12 @@ CHANGED = {
     )),
     "colmap.txt": ("COLMAP", (
         (" 3008", "", "camera '1', OPENCV_FISHEYE must have 8 parameters"),
-        (" -0.00021", "", "camera '1', OPENCV_FISHEYE must have 8 parameters"),
         ("OPENCV_FISHEYE", "EQUI", "model must be one of SIMPLE_PINHOLE"),
         ("1504", "NaN", "camera '1', cx must be a finite number, got 'NaN'"),
     )),
     "nerfstudio.json": ("nerfstudio", (
         ("OPENCV_FISHEYE", "EQUI", "camera_model must be one of"),
         ('"fl_x": 851.2, ', "", "fl_x is missing"),
-        ('"fl_y": 852.9,', "", "fl_y is missing"),
-        ('"h": 1920, ', "", "h is missing"),
         ('"k4": -0.0001', '"k_4": 0.1', "k3 needs k4"),
         ('"camera_m', '"k5": 0.1, "camera_m', "numbers of k5"),
         ('"camera_m', '"distortion_params": [0.1], "camera_m', "numbers of distortion_params"),
@@ -143,8 +137,6 @@ FOUR = ("k1", "k2", "k3", "k4")
 TEXTS = (
     (changed("basalt.json", '"eucm"', '"eucn"'),
      "value0.intrinsics[0].camera_type must be one of ds, eucm", dict(camera=0)),
-    (file_text("basalt.json").replace('"camera_type": "eucm",', "", 1), "camera_type is missing",
-     dict(camera=0)),
     (changed("basalt.json", '"k3": -0.214', '"k3": []'),
      "value0.intrinsics[3].intrinsics.k3 must be a finite number, got []", dict(camera=3)),
     (changed("basalt.json", '"k4": 0.083', '"k4": 0.083, "k5": 0.1'), "kb4 does not use",
@@ -154,7 +146,6 @@ TEXTS = (
     (changed("kitti360_02.yaml", "   k2:", "   k1: 0.1\n   k2:"), "'k1' appears twice"),
     (changed("opencv_omnidir.xml", "<xi>", "<xi>1.1</xi><xi>"), "'xi' appears twice"),
     (changed("opencv_omnidir.xml", "</xi>", ""), "it is not valid XML: mismatched tag"),
-    (TUMVI.replace("camera_model", "model", 1), "cam0.camera_model is missing", dict(camera=0)),
     (COLMAP + "2 SIMPLE_FISHEYE 640 480 400 320 240", "camera '2' appears twice"),
     ("{}", 'The formats are darswin, WoodScape'), ("[1, 2]", "it must be a mapping"),
     ("word", "it must be a mapping"), ("", "it must not be empty"), (" \n\t\n", "be empty"),
@@ -180,7 +171,6 @@ TEXTS = (
     (flat(*FOUR, "D0"), "the fisheye model does not use the numbers of D0"),
     (flat(*FOUR, fx=-1), "fx must be a finite number above 0, got -1"),
     (flat("k1", "k3", "k4", k2=None), "k2 must be a finite number, got None"),
-    (flat("k1", "k2", model="magic"), "got 'magic'"),
     (flat("k1", "k2", xi="a"), "xi must be a finite number"),
     # The region of the sensor.
     (message((-1, 1)), "binning_x must be a whole number of pixels, 0 to"),
@@ -258,13 +248,11 @@ TEXTS = (
     (equidistant(theta_max=95), ("at most 3.142 rad ", "(theta_max_deg takes degrees)")),
     (spherical(fov=170), ("fov must be at most 6.283 rad ", "(fov_deg takes degrees)")),
     (equidistant(theta_max_deg=190), "theta_max_deg must be above 0 and at most 180 de"),
-    (spherical(fov_deg=0), "fov_deg must be above 0 and at most 360 degrees, got 0"),
     (spherical(fov_deg="wide"), "fov_deg must be above 0 and at most 360 degrees, got 'wide'"),
     (spherical(fov_deg=170, theta_max_deg=80), "a Spherical lens has no theta_max_deg"),
     (spherical(fov_deg=170, focal=80), ("fov_deg takes the place of focal, ", "theta_max")),
     (equidistant(fov=1.7), ("fov takes the place of focal, ", "theta_max is half of fov")),
     (equidistant(supported=71), "supported must be above 0 and at most 3.142 rad, got 71"),
-    (equidistant(supported="wide"), "supported must be above 0 and at most 3.142 rad, got 'wide'"),
     (ours("Orthographic", fov_deg=200),
      ("fov_deg is 200, but fov must be at most 3.14", " rad (1", "°)")),
     (ours("Orthographic", focal=9, theta_max_deg=100),
@@ -293,28 +281,23 @@ CASES = [*TEXTS, *of_other_cameras(), *(
 )]  # fmt: skip
 
 
-def words(said):
-    return (said,) if isinstance(said, str) else said
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: words(case[1])[0][-40:])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: str(case[1])[-40:])
 def test_errors_say_what_is_wrong(case):
     text, said, *options = case
     found = refused("calibration in a string: ", loads, text, **dict(*options))
-    assert all(part in found for part in words(said)) and len(found) < 1000
+    said = (said,) if isinstance(said, str) else said
+    assert all(part in found for part in said) and len(found) < 1000
 
 
-@pytest.mark.parametrize(("entries", "said"), [
-    (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
-    (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
-    (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
-    (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
-])  # fmt: skip
-def test_dicts_are_refused_like_files(entries, said):
-    refused(said, from_dict, dict(model="Equidistant") | entries, (100, 100))
+def test_dicts_are_refused_like_files():
+    for entries, said in (
+        (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
+        (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
+        (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
+        (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
+    ):
+        refused(said, from_dict, dict(model="Equidistant") | entries, (100, 100))
 
-
-# -- hostile and large files --------------------------------------------------------------------
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in pairwise("abcdefghij")
@@ -377,8 +360,3 @@ def test_large_files_are_read_soon(tmp_path):
     path.write_text("".join(rows))
     with few_calls(3_000_000):
         load_all(path)
-    # The first bad camera is named, also with little work.
-    rows[700] = rows[700].replace("310", "1e-300")
-    path.write_text("".join(rows))
-    with few_calls(3_000_000):
-        refused(r"COLMAP calibration .*: camera '701': ", load_all, path)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rigs
 import torch
+from scipy.spatial.transform import Rotation
 
 from darswin import boxes, frames, views
 from darswin.calibrate import calibrate
@@ -21,8 +22,6 @@ RNG = np.random.default_rng(0)
 SIZE = (48, 64)
 CAMERA = Equidistant(20.0, theta_max=1.2, image_size=SIZE)
 ROOM = views.PerspectiveView((24, 32))
-RIG = rigs.rig(rigs.true_lens("KannalaBrandt", 120, seed=1), 6)
-CORNERS = RIG.corners.numpy()
 PICTURE = RNG.integers(0, 256, (*SIZE, 3), np.uint8)
 VALUES = RNG.uniform(1, 9, (48, 48)).astype(np.float32)
 PLACES = RNG.uniform(10, 40, (6, 2))
@@ -31,12 +30,22 @@ FULL = FullSize(fitted(SIZE, 48, "crop").at(CAMERA, SIZE))
 MOVED = views.CropView((4, 4, 40, 40), (30, 30), views.Turn(0.3)).at(CAMERA, SIZE)
 REMAP = ROOM.at(CAMERA, SIZE)
 MERCATOR = views.MercatorView((48, 64)).at(CAMERA, SIZE)
+TURNED = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
 PLAN = camera.plan(ROOM, CAMERA, SIZE)
 
 
 @functools.cache
+def rig():
+    return rigs.rig(rigs.true_lens("KannalaBrandt", 120, seed=1), 6)
+
+
+def corners():
+    return rig().corners.numpy()
+
+
+@functools.cache
 def calibrated():
-    return calibrate(CORNERS, RIG.board, RIG.size, "KannalaBrandt")
+    return calibrate(corners(), rig().board, rig().size, "KannalaBrandt")
 
 
 def _array(found):
@@ -74,20 +83,14 @@ CASES = {
     "unproject_points": (CAMERA.unproject_points, PLACES),
     "with_theta_max": (lambda a: CAMERA.with_theta_max(a).theta_max, np.array([1.0])),
     "up": (lambda a: views.MercatorView((24, 48), up=a).up, np.array([0.1, -1, 0.2])),
-    "up_of": (
-        lambda a: views.up_of(extrinsics=a),
-        rigs.turn(torch.tensor([0.1, 0.2, 0.3]).double()).numpy(),
-    ),
+    "up_of": (lambda a: views.up_of(extrinsics=a), TURNED),
     "to_view": (REMAP.to_view, PLACES),
     "to_image": (REMAP.to_image, PLACES / 2),
-    "corners": (lambda a: checked(a, RIG.board, RIG.size)[0].corners, CORNERS),
-    "list of corners": (lambda a: checked([*a], RIG.board, RIG.size)[0].corners, CORNERS),
-    "board": (lambda a: checked(CORNERS, a, RIG.size)[1], RIG.board.numpy()),
+    "corners": (lambda a: checked(a, rig().board, rig().size)[0].corners, corners),
+    "list of corners": (lambda a: checked([*a], rig().board, rig().size)[0].corners, corners),
+    "board": (lambda a: checked(corners(), a, rig().size)[1], lambda: rig().board.numpy()),
     "uncertainty": (lambda a: calibrated().uncertainty(a), 10 * PLACES),
-    "uncertainty_of_theta": (
-        lambda a: calibrated().uncertainty_of_theta(a),
-        np.linspace(0.1, 1, 6),
-    ),
+    "of theta": (lambda a: calibrated().uncertainty_of_theta(a), np.linspace(0.1, 1, 6)),
     "carry": (lambda a: boxes.carry(a, MOVED.to_view)[0], BOXES),
     "carry_points": (lambda a: boxes.carry_points(a, MOVED.to_view), PLACES),
     "carry_polygon": (lambda a: boxes.carry_polygon(a, MOVED.to_view), PLACES),
@@ -126,6 +129,7 @@ FORMS = {
 @pytest.mark.parametrize("case", CASES)
 def test_a_view_counts_as_its_copy(case):
     function, value = CASES[case]
+    value = value() if callable(value) else value
     expected = _array(function(value))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

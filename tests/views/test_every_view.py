@@ -12,7 +12,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from frame_samples import bilinear
-from helpers import in_turn
+from helpers import in_turn, refused
 from torch import nn
 from torch.testing import assert_close
 from torch.utils._pytree import tree_leaves
@@ -56,12 +56,11 @@ OPTIONS = {
 }
 OTHER = Spherical.from_fov(0.5, 2.2, 30.0, center=[29.5, 31.0], image_size=(64, 60))
 SHEARED = KannalaBrandt(25.0, [0.02], 1.1, affine=[[1, 0.1], [0, 0.9]], image_size=(50, 60))
+FLAT = Perspective(25.0, image_size=(50, 60))
 MADE = {
     "camera": lambda **options: CameraView(OTHER, turn=Turn(0.4, True), **options),
     "camera of another kind": lambda **options: CameraView(SHEARED, **options),
-    "camera up to 90°": lambda **options: CameraView(
-        Perspective(25.0, image_size=(50, 60)), **options
-    ),
+    "camera up to 90°": lambda **options: CameraView(FLAT, **options),
     "crop": lambda **_: CropView((10, 20, 71, 83), (34, 45)),
     "turned crop": lambda **_: CropView((10, 20, 71, 83), (34, 45), Turn(-0.6, True)),
 }
@@ -91,9 +90,8 @@ def smooth():
 
 def by_loops(remap, supersampling=1):
     """The points of the picture that the pixels of a view show, (k·H', k·W', 2), from rays."""
-    y, x = (
-        (np.arange(side * supersampling) + 0.5) / supersampling - 0.5 for side in remap.view_size
-    )
+    sides = (side * supersampling for side in remap.view_size)
+    y, x = ((np.arange(side) + 0.5) / supersampling - 0.5 for side in sides)
     grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
     if isinstance(remap.view, CropView) or not remap.view.uses_lens:
         return remap.view.to_image(grid, remap.lens, remap.size)[0].numpy()
@@ -320,9 +318,6 @@ def test_of_every_view(holds, name, kind):
     holds(name, LENSES[kind])
 
 
-# -- of every view, whatever the lens -----------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMED)
 @pytest.mark.parametrize("tangential", [None, [[0.02, 0.01]]])
 def test_gradients_reach_images_and_lens(name, tangential):
@@ -350,15 +345,13 @@ def test_frames_of_uint8_are_normalized(name):
     assert exact.dtype == torch.float64
     assert_close(exact.float(), view(planes, lens), rtol=1e-4, atol=1e-4)
     refuses = make_view(name, (16, 16), mean=None, std=None)
-    with pytest.raises((TypeError, ValueError), match="mean"):
-        refuses(frames, lens)
+    refused("mean", refuses, frames, lens, error=(TypeError, ValueError))
     for mean, std, message in (
         (0.5, 0.0, r"std must be positive, got 0\.0"),
         ((0.1, 0.2), (0.1, 0.2, 0.3), r"mean must be one number or one per channel \(3\)"),
         (None, 0.5, "mean and std must be given together, got None and 0.5"),
     ):
-        with pytest.raises(ValueError, match=message):
-            make_view(name, (16, 16), mean=mean, std=std)
+        refused(message, make_view, name, (16, 16), mean=mean, std=std)
 
 
 def convolution():
@@ -366,6 +359,7 @@ def convolution():
 
 
 UNET = dict(image_size=32, patch_size=2, window=(2, 2), task="distance", rays=True)
+CONV = dict(widths=(4, 6), size=32, task="distance")
 SWIN = dict(depths=(1, 1), num_heads=(1, 2), embed_dim=8, image_size=32)
 # Networks on a view of 32 × 32 px, by its name.
 NETWORKS = {
@@ -374,9 +368,7 @@ NETWORKS = {
     "Swin": lambda view: Swin(4, view=view, **SWIN),
     "Unet": lambda view: create_model("swin_unet_nano", view=view, **UNET),
     "Unet of tokens": lambda view: create_model("swin_unet_nano", view=view, skip_width=0, **UNET),
-    "Unet of convolutions": lambda view: create_model(
-        "conv_unet_nano", widths=(4, 6), view=view, size=32, task="distance"
-    ),
+    "Unet of convolutions": lambda view: create_model("conv_unet_nano", view=view, **CONV),
 }
 DTYPES = (torch.float32, torch.bfloat16, torch.float64)
 
@@ -389,8 +381,7 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float64)
 def test_networks_get_what_the_view_sees_in_their_dtype(kind, name, dtype):
     make = NETWORKS[kind]
     if name == "tiles" and "adapter" not in kind:
-        with pytest.raises(ValueError, match="one picture of each image, but the view shows 5"):
-            make(name)
+        refused("one picture of each image, but the view shows 5", make, name)
         return
     model, frames = make(name).to(dtype).eval(), torch.randint(256, (2, 32, 32, 3)).byte()
     lens = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -418,7 +409,10 @@ class AnyRatio(PixelView):
         return self.of(lens).project_points(rays, self.size)
 
 
-def test_a_view_of_ones_own_needs_two_methods(monkeypatch):
+def test_a_view_of_ones_own_needs_two_methods_and_has_a_name(monkeypatch):
+    monkeypatch.setitem(_VIEWS, "tall polar", None)  # and is removed again
+    register_view("tall polar")(lambda size, **_: PolarView(*size, samples=(2, 1), layout="image"))
+    assert make_view("tall polar", (16, 8)).map_size == (32, 8)
     monkeypatch.setitem(_VIEWS, "own", AnyRatio)
     test_gradients_reach_images_and_lens("own", None)
     what_is_seen_comes_back_also_from_coarser_maps("own", LENSES["general"])
@@ -428,51 +422,32 @@ def test_a_view_of_ones_own_needs_two_methods(monkeypatch):
         test_networks_get_what_the_view_sees_in_their_dtype(kind, "own", torch.bfloat16)
     assert repr(make_view("own", (24, 32))) == "AnyRatio(size=(24, 32))"
     monkeypatch.setitem(_VIEWS, "own", lambda _size: View())
-    with pytest.raises(TypeError, match="'own' has no option 'mean'; it has none"):
-        make_view("own", (24, 32))
-
-
-def test_a_view_of_ones_own_has_a_name(monkeypatch):
-    monkeypatch.setitem(_VIEWS, "tall polar", None)  # and is removed again
-    register_view("tall polar")(
-        lambda size, **options: PolarView(*size, samples=(2, 1), layout="image", **options)
-    )
-    adapter = LensAdapter(nn.Identity(), (16, 8), view="tall polar")
-    assert adapter.view.map_size == (32, 8)
-    assert adapter(torch.rand(1, 3, *SIZE), LENSES["circle"]).shape == (1, 3, *SIZE)
-
-
-@pytest.mark.parametrize("name", sorted(set(list_views()) - {"none"}))
-def test_lenses_and_pixels_that_do_not_fit_are_refused(name):
-    view, lens, images = make_view(name, (16, 16)), LENSES["two"], torch.rand(3, 3, *SIZE)
-    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
-        view(images, lens)
-    with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
-        view(images)
-    with pytest.raises(ValueError, match=r"images of \(H, W\) = \(90, 120\), got images of \(9"):
-        view(torch.rand(1, 3, 9, 9), lens)
-    prepared = view.prepare(lens, SIZE)
-    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
-        view.check_seen(torch.rand(3 * view.count, 3, 16, 16), prepared, 3)
-    with pytest.raises(ValueError, match=r"\(H, W\) = \(16, 16\), got \(16, 17\)"):
-        view.check_seen(torch.rand(2, 3, 16, 17), prepared, 3)
+    refused("'own' has no option 'mean'; it has none", make_view, "own", (24, 32), error=TypeError)
 
 
 @every_view
-def test_images_of_ints_and_wrong_sizes_are_refused(name):
+def test_sizes_images_lenses_and_pixels_that_do_not_fit_are_refused(name):
     for size in ([16, 16], (np.int64(16), 16), 16):
         view = make_view(name, size)
         assert (view.map_size if name == "polar" else view.size) == (16, 16)
     for wrong in (16.5, (16.0, 16.0), (16,), "16"):
-        with pytest.raises(TypeError, match="size must be a pair of ints, got"):
-            make_view(name, wrong)
+        refused("size must be a pair of ints, got", make_view, name, wrong, error=TypeError)
     for wrong in ((0, 0), (-4, -4)):
-        with pytest.raises(ValueError, match=r"must be (an int of )?at least 1"):
-            make_view(name, wrong)
-    with pytest.raises(TypeError, match=r"images? must be "):
-        make_view(name, (16, 16))(torch.zeros(1, 3, *SIZE, dtype=torch.int32), LENSES["cut"])
+        refused(r"must be (an int of )?at least 1", make_view, name, wrong)
+    integers = torch.zeros(1, 3, *SIZE, dtype=torch.int32)
+    refused(r"images? must be ", view, integers, LENSES["cut"], error=TypeError)
     if name != "polar":
         remap = view_of(name).at(LENSES["cut"], SIZE)
         for move in (remap.to_image, remap.to_view):
-            with pytest.raises(ValueError, match=r"points must have shape \(..., 2\), got \(3,\)"):
-                move([1.0, 2.0, 3.0])
+            refused(r"points must have shape \(..., 2\), got \(3,\)", move, [1.0, 2.0, 3.0])
+    if name == "none":
+        return
+    lens, images = LENSES["two"], torch.rand(3, 3, *SIZE)
+    refused("each of the 3 images, got 2", view, images, lens)
+    refused(r"lens must be a darswin\.lens\.Lens, got NoneType", view, images, error=TypeError)
+    said = r"images of \(H, W\) = \(90, 120\), got images of \(9"
+    refused(said, view, torch.rand(1, 3, 9, 9), lens)
+    prepared, seen = view.prepare(lens, SIZE), torch.rand(3 * view.count, 3, 16, 16)
+    refused("each of the 3 images, got 2", view.check_seen, seen, prepared, 3)
+    seen = torch.rand(2, 3, 16, 17)
+    refused(r"\(H, W\) = \(16, 16\), got \(16, 17\)", view.check_seen, seen, prepared, 3)

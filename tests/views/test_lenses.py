@@ -21,9 +21,7 @@ HALF = 0.25  # rad, of the cone that is looked at
 
 def cone(to_rays, size, middle):
     """The pixels of (H, W) whose rays are near a direction. Every picture shows them as a disc."""
-    y, x = torch.meshgrid(
-        *(torch.arange(side, dtype=torch.float64) for side in size), indexing="ij"
-    )
+    y, x = torch.from_numpy(np.indices(size, float))
     rays = to_rays(torch.stack((x, y), -1)[None])[0].nan_to_num().numpy()
     return (rays @ middle > math.cos(HALF)).astype(np.uint8)
 
@@ -43,9 +41,8 @@ def outline(mask):
 
 
 def filled(polygon, size):
-    return cv2.fillPoly(
-        np.zeros(size, np.uint8), [np.rint((polygon - 0.5) * 16).astype(np.int32)], 1, shift=4
-    )
+    points = np.rint((polygon - 0.5) * 16).astype(np.int32)
+    return cv2.fillPoly(np.zeros(size, np.uint8), [points], 1, shift=4)
 
 
 @functools.cache
@@ -71,13 +68,11 @@ MODELS = [*every_lens()]
 
 
 # Each view with a few models of lenses in turn; with all in `make test-products`.
-@pytest.mark.parametrize(
-    ("name", "models"),
-    [
-        *((name, MODELS[k :: len(OF_PIXELS)]) for k, name in enumerate(OF_PIXELS)),
-        *(pytest.param(name, MODELS, marks=[slow, products]) for name in OF_PIXELS),
-    ],
-)
+IN_TURN = [(name, MODELS[k :: len(OF_PIXELS)]) for k, name in enumerate(OF_PIXELS)]
+ALL = [pytest.param(name, MODELS, marks=[slow, products]) for name in OF_PIXELS]
+
+
+@pytest.mark.parametrize(("name", "models"), IN_TURN + ALL)
 def test_labels_of_every_form_go_through_every_lens(name, models):
     checked, overlaps = set(), []
     view_size = {"none": SIZE, "panorama": (150, 420)}.get(name, (180, 180))
@@ -132,9 +127,7 @@ def test_points_of_views_are_those_of_opencv(name):
         flat = np.array([warper.warpPoint(tuple(place), eye, eye) for place in places.tolist()])
         remap = view.at(lens.to(torch.float64), (480, 640))
         expected, inside = flat / step + side / 2, (np.abs(pixels - [319.5, 239.5]) < [320, 240])
-        np.testing.assert_allclose(
-            of_boxes.carry_points(pixels + 0.5, remap.to_view), expected, atol=2e-3
-        )
-        inside = inside.all(-1)
-        found = remap.to_image(expected - 0.5)
+        found = of_boxes.carry_points(pixels + 0.5, remap.to_view)
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+        inside, found = inside.all(-1), remap.to_image(expected - 0.5)
         np.testing.assert_allclose(found[inside], pixels[inside], atol=2e-3)

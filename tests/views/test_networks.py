@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import in_turn, network, slow
+from helpers import in_turn, network, refused, slow
 from torch import nn
 from torch.testing import assert_close
 from torch.utils._pytree import tree_leaves
@@ -14,13 +14,7 @@ from torch.utils._pytree import tree_leaves
 from darswin import create_model, frames, optimize
 from darswin.deploy import camera
 from darswin.deploy.export import export_program
-from darswin.lens import (
-    BrownConrady,
-    Equidistant,
-    Perspective,
-    Polynomial,
-    Spherical,
-)
+from darswin.lens import BrownConrady, Equidistant, Perspective, Polynomial, Spherical
 from darswin.models import LensAdapter, Swin
 from darswin.views import CameraView, PlainView, PolarView, View, list_views, make_view
 
@@ -43,9 +37,6 @@ def smooth(height, width):
     return torch.stack((torch.sin(x / 12), torch.cos(y / 12), torch.sin((x + y) / 16)))[None]
 
 
-# -- squares and adapters -----------------------------------------------------------------------
-
-
 def test_a_field_of_view_gives_things_one_size_in_the_square():
     edge, seen = 1.2, []
     wide, square = Equidistant(40.0, 1.5), make_view("square", 32, fov=2 * edge)
@@ -53,8 +44,7 @@ def test_a_field_of_view_gives_things_one_size_in_the_square():
     adapter.network.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
     for lens in (wide, wide.with_theta_max(0.8)):
         out = adapter(images, lens)
-        inside = (angles(lens, (130, 130)) <= min(edge, lens.theta_max.item()))[:, None]
-        inside = inside.expand_as(out)
+        inside = (angles(lens, (130, 130)) <= min(edge, lens.theta_max.item())).expand_as(out)
         assert (out[~inside] == 0).all() and (out[inside] > 0.9).float().mean() > 0.97
     common = seen[1] > 0.9
     assert common.float().mean() == pytest.approx((0.8 / edge) ** 2, abs=0.05)
@@ -109,9 +99,8 @@ def test_outputs_of_any_resolution_come_back_and_others_pass_through():
     sampled = adapter.sample(images, prepared)
     assert sampled.shape == (2, 3, 32, 32)
     assert_close(adapter.run_sampled(sampled, prepared), out, rtol=0, atol=0)
-    assert_close(
-        out["masks"][1][0], adapter.view.back(F.avg_pool2d(sampled, 2)[:, :2], prepared.view)
-    )
+    coarse = adapter.view.back(F.avg_pool2d(sampled, 2)[:, :2], prepared.view)
+    assert_close(out["masks"][1][0], coarse)
     assert_close(adapter(images, LENSES[:1])["label"][0], out["label"][0])
 
 
@@ -123,9 +112,6 @@ def test_a_view_reaches_as_far_as_the_lens_up_to_its_limit():
     for lens, reach in ((Polynomial([20.0], math.radians(95)), end), (narrow, math.radians(80))):
         view = make_view("perspective", 64, reach=reach, theta_max=end, **sharp)
         assert_close(view(picture, lens), expected, rtol=0, atol=1e-4)
-
-
-# -- models on views ----------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -159,10 +145,9 @@ def test_on_a_view_it_is_a_lens_adapter_around_it(view):
 def test_a_view_may_have_another_size_than_the_images(name):
     images = torch.rand(2, 3, 32, 32)
     sizes = dict(view=make_view(name, (16, 40)), image_size=32, patch_size=2, window=(4, 5))
+    sizes |= dict(depths=(1, 1), num_heads=(1, 2))
     for task in ("segmentation", "distance"):
-        model = create_model(
-            "swin_unet_nano", depths=(1, 1), num_heads=(1, 2), task=task, **sizes
-        ).eval()
+        model = create_model("swin_unet_nano", task=task, **sizes).eval()
         assert model(images, LENSES).shape == (2, model.num_classes, 32, 32)
         assert model.sample(images, model.prepare(LENSES, (32, 32))).shape[2:] == (16, 40)
     with pytest.raises(ValueError, match=r"image_size, \(H, W\) = \(32, 32\), got \(16, 40\)"):
@@ -171,15 +156,10 @@ def test_a_view_may_have_another_size_than_the_images(name):
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    ("name", "view"),
-    [
-        ("darswin_unet_a_nano", None),
-        ("swin_unet_nano", dict(name="perspective", reach=1.5)),
-        ("swin_unet_nano", dict(name="square", fov=3.0)),
-    ],
+    "view", [None, dict(name="perspective", reach=1.5), dict(name="square", fov=3.0)]
 )
-def test_the_head_reads_the_rays_of_its_pixels(name, view):
-    options = dict(view=view) if view else {}
+def test_the_head_reads_the_rays_of_its_pixels(view):
+    name, options = ("swin_unet_nano", dict(view=view)) if view else ("darswin_unet_a_nano", {})
     model, blind = (network(name, rays=rays, **options) for rays in (True, False))
     prepared = model.prepare(WIDE, (64, 64))
     if view:
@@ -201,27 +181,23 @@ def test_the_head_reads_the_rays_of_its_pixels(name, view):
     assert_close(blind(images, WIDE), model(images, WIDE))
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "rays"),
-    [
+def test_distances_read_rays_where_there_are_a_lens_and_convolutions():
+    for name, options, rays in (
         ("darswin_unet_a_nano", dict(task="distance"), True),
         ("darswin_unet_a_nano", {}, False),
         ("darswin_unet_a_nano", dict(task="distance", rays=False), False),
         ("darswin_unet_a_nano", dict(rays=True, skip_width=0), False),
         ("swin_unet_nano", dict(task="distance", rays=True), False),
-    ],
-)
-def test_distances_read_rays_where_there_are_a_lens_and_convolutions(name, options, rays):
-    model = network(name, **options)
-    assert model.reads_rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
-    if model.head.skip_width:
-        assert model.head.stem.in_channels == (6 if rays else 3)
+    ):
+        model = network(name, **options)
+        assert model.reads_rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
+        if model.head.skip_width:
+            assert model.head.stem.in_channels == (6 if rays else 3)
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
     places = PlainView((64, 64)).token_positions(None, (2, 4))
-    x, y = torch.tensor([-0.75, -0.25, 0.25, 0.75]), torch.tensor([-0.5, 0.5])
-    assert_close(places, torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None])
+    assert_close(places[0], (torch.stack(pixels(2, 4), -1) + 0.5) / torch.tensor([2, 1]) - 1)
 
 
 @pytest.mark.slow
@@ -261,24 +237,19 @@ PATHS = {
 TASKS = ("segmentation", "distance")
 # Models, tasks and paths. One view of a picture at a time is enough: a model takes its mask.
 DENSE = [
-    (name, task, path)
-    for name, task, path in itertools.product(("conv_unet_nano", "swin_unet_nano"), TASKS, PATHS)
-    if (name, path) != ("conv_unet_nano", "frames") and path != "export"
+    *itertools.product(["conv_unet_nano"], TASKS, ["eager", "optimized"]),
+    *itertools.product(["swin_unet_nano"], TASKS, ["eager", "optimized", "frames"]),
 ]
 DENSE_CASES = [
     *in_turn(DENSE, sorted({*list_views()} - {"none", "tiles", "polar"})),
     *(("darswin_unet_a_nano", *row, "polar") for row in itertools.product(TASKS, [*PATHS][:3])),
     *(("swin_unet_nano", "distance", path, "polar") for path in ("eager", "optimized")),
     *(("adapter", TASKS[0], "eager", name) for name in list_views() if name != "none"),
-    *(
-        pytest.param(name, task, "export", view, marks=slow)
-        for name, views in (
-            ("conv_unet_nano", ("mercator", "panorama")),
-            ("swin_unet_nano", ("square", "polar")),
-            ("darswin_unet_a_nano", ("polar", "polar")),
-        )
-        for task, view in zip(TASKS, views, strict=True)
-    ),
+    pytest.param("conv_unet_nano", "segmentation", "export", "mercator", marks=slow),
+    pytest.param("conv_unet_nano", "distance", "export", "panorama", marks=slow),
+    pytest.param("swin_unet_nano", "segmentation", "export", "square", marks=slow),
+    pytest.param("swin_unet_nano", "distance", "export", "polar", marks=slow),
+    *(pytest.param("darswin_unet_a_nano", of, "export", "polar", marks=slow) for of in TASKS),
 ]
 
 
@@ -310,8 +281,6 @@ def test_a_dense_model_has_no_answer_where_its_view_shows_nothing(name, task, pa
         assert not result[0, :, ~shown].any()
 
 
-# -- errors -------------------------------------------------------------------------------------
-
 THREE = torch.zeros(3, 3, 40, 40)
 
 
@@ -321,28 +290,19 @@ THREE = torch.zeros(3, 3, 40, 40)
         (lambda: make_view("round", (8, 8)), ValueError, "view must be one of .*, got 'round'"),
         (lambda: make_view("none", (8, 8), fov=1.0), TypeError, "'fov'; it has mean, std"),
         (lambda: make_view("square", (8, 9)), ValueError, r"must be square, got \(8, 9\)"),
-        (lambda: make_view("square", (8, 8), mean=0.5, std=None), ValueError, "given together"),
         (lambda: make_view("square", 8, spacing="tan")(THREE, Equidistant(9.0, 1.7)), ValueError,
          "spacing='tan' needs lenses"),
         (lambda: make_view("mercator", 8, spacing="g"), TypeError,
          "'mercator' has no option 'spacing'; it has fov, theta_max, up,"),
         (lambda: View().prepare(None, (8, 8)), NotImplementedError, ""),
         (lambda: LensAdapter(nn.Identity()), TypeError, "size must be .*, got None"),
-        (lambda: LensAdapter(nn.Identity(), (8, 8, 8)), TypeError, r"size must be .*\(8, 8, 8\)"),
         (lambda: LensAdapter(nn.Identity(), -1), ValueError, "size must be at least 1.*, got"),
-        (lambda: LensAdapter(nn.Identity(), 8, view="round"), ValueError, "view must be one of"),
         (lambda: LensAdapter(nn.Identity(), view=PolarView()), ValueError, "a view of pixels"),
-        (lambda: LensAdapter(nn.Identity(), 8, view=make_view("none", (8, 8))), ValueError,
-         "has its own size"),
         (lambda: LensAdapter(nn.Identity(), 8, view=make_view("none", (8, 8)), mean=0.0),
          ValueError, "has its own size and mean"),
         (lambda: LensAdapter(nn.Identity(), 8, output="maps"), ValueError, "output must be"),
         (lambda: LensAdapter(nn.Identity(), 8)(THREE.byte(), LENSES[:1]), TypeError,
          r"images must be in floating point, got torch\.uint8"),
-        (lambda: LensAdapter(nn.Identity(), 8)(THREE, LENSES), ValueError,
-         "each of the 3 images, got 2"),
-        (lambda: LensAdapter(nn.Identity(), 8)(THREE, None), TypeError,
-         r"lens must be a darswin\.lens\.Lens, got NoneType"),
         (lambda: Swin(view=PolarView()), ValueError, "a view of pixels"),
         (lambda: Swin(image_size=32, view=make_view("mercator", (30, 63))), ValueError,
          r"patch_size must divide .* = \(30, 63\), got 2"),
@@ -352,5 +312,4 @@ THREE = torch.zeros(3, 3, 40, 40)
     ],
 )  # fmt: skip
 def test_wrong_views_are_explained(make, kind, message):
-    with pytest.raises(kind, match=message):
-        make()
+    refused(message, make, error=kind)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import CAMERAS
+from helpers import CAMERAS, refused
 from torch.testing import assert_close
 
 from darswin.layers.embed import PolarPatchEmbed
@@ -24,9 +24,8 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
     return Spherical.from_fov(torch.tensor(xi, dtype=f64), fov, radius)
 
 
-@pytest.mark.parametrize(
-    ("xi", "spacing", "radii"),
-    [  # the borders of rings 1, 2, 4, 8, 12 and 15 in a 64 px image
+def test_ring_borders_in_pixels():
+    for xi, spacing, radii in (  # the borders of rings 1, 2, 4, 8, 12 and 15 in a 64 px image
         (0.0, "tan", (2, 4, 8, 16, 24, 30)),
         (0.0, "theta", (0.14, 0.29, 0.60, 1.43, 3.29, 10.49)),
         (0.2, "tan", (7.9, 13.4, 20.2, 26.8, 30.1, 31.6)),
@@ -36,14 +35,10 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
         (1.0, "tan", (16.8, 23.2, 27.8, 30.5, 31.5, 31.9)),
         (1.0, "theta", (1.60, 3.20, 6.47, 13.4, 21.6, 29.1)),
         (0.7, "radius", (2, 4, 8, 16, 24, 30)),
-    ],
-)
-def test_ring_borders_in_pixels(xi, spacing, radii):
-    borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders
-    got = borders[0, [1, 2, 4, 8, 12, 15]]
-    assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
-    assert borders[0, 0] == 0
-    assert_close(borders[0, -1], torch.tensor(32.0, dtype=f64))
+    ):
+        borders = PolarView(**SIZES, spacing=spacing).grid(spherical(xi), (64, 64)).borders[0]
+        expected = torch.tensor((0, *radii, 32), dtype=f64)
+        assert_close(borders[[0, 1, 2, 4, 8, 12, 15, 16]], expected, rtol=0, atol=0.06)
 
 
 @pytest.mark.parametrize(
@@ -117,9 +112,8 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
     assert torch.autograd.gradcheck(radii, (xi, focal, theta_max))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_wrong_settings():
+    for change, message in (
         (dict(rings=0), "rings must be an int of at least 1, got 0"),
         (dict(sectors=2.0), "sectors must be an int"),
         (dict(samples=(0, 3)), r"samples must be \(S_r, S_φ\)"),
@@ -133,17 +127,8 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
         (dict(theta_max=1.0, sample_spacing="tan"), "needs spacing='theta', got 'tan'"),
         (dict(jitter=2.0), "jitter"),
         (dict(layout="rows"), "layout"),
-    ],
-)
-def test_wrong_settings(change, message):
-    with pytest.raises(ValueError, match=message):
-        PolarView(**(SIZES | change))
-
-
-def camera(**aside):
-    """A camera with the numbers of tests/lens/files/kitti360_02.yaml, to 95°."""
-    return Mei(torch.tensor([2.35], dtype=f64), 1390.0, [0.032, 2.4], math.radians(95),
-               [708.5, 697.0], **aside)  # fmt: skip
+    ):
+        refused(message, PolarView, **(SIZES | change))
 
 
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
@@ -157,7 +142,8 @@ def camera(**aside):
     ],
 )
 def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
-    lens = camera(**aside)
+    xi = torch.tensor([2.35], dtype=f64)  # as in tests/lens/files/kitti360_02.yaml, to 95°
+    lens = Mei(xi, 1390.0, [0.032, 2.4], math.radians(95), [708.5, 697.0], **aside)
     grid = PolarView(**SIZES, spacing=spacing).grid(lens, (1400, 1400))
     around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
     matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
@@ -206,15 +192,6 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
     inner = (exact > angles[0]) & (exact < end)
     assert inner.any() and (found[inner] - exact[inner]).abs().max() < 0.1 * end
     assert not found[exact.isnan()].any()
-
-
-@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
-def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
-    lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
-    view = PolarView(4, 8, (1, 1), spacing=spacing)
-    grid = view.grid(lens, (64, 64))
-    around = grid.radii[0, :, None, None] * direction_of(grid.azimuths)
-    assert_close(view.token_rays(lens), lens.unproject_points((around + grid.center[0])[None]))
 
 
 # -- samples and their embedding ----------------------------------------------------------------
@@ -277,16 +254,19 @@ def test_it_jitters_only_in_training_and_by_torchs_generator():
     assert torch.equal(sample(images, LENSES), first) and not torch.equal(first, second)
 
 
-@pytest.mark.parametrize(
-    ("shape", "given", "last"),
-    [((2, 32, 33, 4), None, True), ((2, 1, 32, 3), False, False), ((2, 32, 3, 1), True, True)],
-)
-def test_uint8_images(shape, given, last):
-    images = torch.randint(256, shape, dtype=torch.uint8)
-    planes = images.permute(0, 3, 1, 2) if last else images
+def test_images_of_uint8_and_those_that_do_not_fit():
     sample = PolarView(4, 8, (3, 2), mean=0.4, std=0.2)
-    expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
-    assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+    shapes = ((2, 32, 33, 4), None), ((2, 1, 32, 3), False), ((2, 32, 3, 1), True)
+    for shape, given in shapes:
+        images = torch.randint(256, shape, dtype=torch.uint8)
+        planes = images.permute(0, 3, 1, 2) if given in (None, True) else images
+        expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
+        assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+    refused(r"\(B, C, H, W\), got \(3, 32", sample, torch.zeros(3, 32, 32), LENSES)
+    refused("images must be a tensor, got list", sample, [1], LENSES, error=TypeError)
+    refused("both .* pass channels_", sample, torch.zeros(2, 1, 32, 3).byte(), LENSES)
+    wrong = torch.zeros(2, 1, 9, 9), LENSES, "yes"
+    refused("channels_last must be True", sample, *wrong, error=TypeError)
 
 
 @pytest.mark.slow
@@ -298,17 +278,3 @@ def test_a_calibrated_camera_compiles(lens):
     images, lens = torch.rand(1, 3, 96, 128), lens.resized((96, 128))
     compiled = torch.compile(sample, fullgraph=True, backend="aot_eager")
     assert_close(compiled(images, lens), sample(images, lens))
-
-
-@pytest.mark.parametrize(
-    ("images", "lens", "last", "error", "message"),
-    [
-        (torch.zeros(3, 32, 32), LENSES, None, ValueError, r"\(B, C, H, W\), got \(3, 32"),
-        ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
-        (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
-        (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
-    ],
-)
-def test_images_and_lenses_that_do_not_fit(images, lens, last, error, message):
-    with pytest.raises(error, match=message):
-        PolarView(4, 8, (2, 2))(images, lens, last)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -104,8 +105,7 @@ def test_pictures_and_maps_that_do_not_fit_are_refused():
         (lambda: CameraView(OTHER, turn=0.3), TypeError, "turn must be .*Turn, got 0.3"),
         (lambda: CameraView("front.json"), TypeError, "lens must be a .*Lens, got str"),
     ):
-        with pytest.raises(kind, match=message):
-            call()
+        refused(message, call, error=kind)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
