@@ -53,10 +53,12 @@ def in_turn(rows, last):
     ]
 
 
-def slow_but(rows, *fast):
-    """The rows, for `parametrize`: all but some are slow."""
+def slow_but(rows, *fast, marks=slow):
+    """The rows, for `parametrize`: all but some are slow, or have other marks."""
     return [
-        pytest.param(*(row if isinstance(row, tuple) else [row]), marks=[] if row in fast else slow)
+        pytest.param(
+            *(row if isinstance(row, tuple) else [row]), marks=[] if row in fast else marks
+        )
         for row in rows
     ]
 

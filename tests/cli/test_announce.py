@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from helpers import products, slow_but
 from runs import DIGITS, checkpoint, fit, test
 
 
@@ -116,7 +117,7 @@ OURS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bar", [False, None, True])
+@pytest.mark.parametrize("bar", slow_but([False, None, True], None, marks=products))
 def test_fit_validate_and_test_print_only_our_own_lines(tmp_path, bar):
     shown = ["--trainer.enable_progress_bar", json.dumps(bar)]
     start = ["fit", "--run", "run", "--config", "minutes", "--data.path", "digits"]

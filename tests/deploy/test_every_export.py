@@ -187,9 +187,9 @@ def test_every_model(kind, lens, written, input, fixed, pixels, tmp_path):
     [
         ("classifier A", "Polynomial", False),
         ("classifier RA", "Polynomial", True),
-        ("perspective", "Spherical", False),
         ("dat", "Spherical", False),
-        ("unet A", "Spherical", False),
+        pytest.param("perspective", "Spherical", False, marks=products),
+        pytest.param("unet A", "Spherical", False, marks=products),
         ("unet square", "Spherical", True),
     ],
 )
@@ -197,8 +197,8 @@ def test_openvino(kind, lens, fixed, tmp_path):
     check(kind, lens, "openvino", "images", fixed, tmp_path / "model.onnx")
 
 
-# A search for the angle in a table, along the radius and in the plane.
-SEARCHES = ("Tabulated", "Polynomial", "Mei, general")
+# A search for the angle in a table and along the radius; that in the plane is in a package below.
+SEARCHES = ("Tabulated", "Polynomial")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_every_lens(kind, lens, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["unet A", "conv"])
+@pytest.mark.parametrize("kind", [pytest.param("unet A", marks=products), "conv"])
 def test_a_package_with_rays_through_a_general_lens(kind, tmp_path):
     model, lens = model_of(kind), lenses_of("Mei, general")[:1]
     path = tmp_path / "model.pt2"

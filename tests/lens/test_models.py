@@ -243,6 +243,15 @@ def test_angles_at_the_sides_of_the_image():
     assert small.side_angles()[0].tolist()[1] == small.theta_limit.item()
 
 
+def test_spherical_has_the_papers_focal_lengths():
+    # The circle fills a 64 px image at a field of view of 174.63° (released data).
+    xi = double(0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 0.93, 1.0)
+    lens = Spherical.from_fov(xi, 3.0479112779, 32.0)
+    expected = double(1.5, 3.102, 7.907, 12.712, 17.518, 23.925, 31.293, 33.535)
+    assert_close(lens.focal, expected, rtol=0, atol=1e-3)
+    assert_close(lens.r_max, torch.full((8,), 32.0, dtype=f64))
+
+
 @pytest.mark.parametrize("name", [name for name, m in MODELS.items() if issubclass(m, FocalLens)])
 def test_the_field_of_view_fills_the_circle(name):
     lens = example(name, torch.Generator().manual_seed(2))

@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 import torch
-from helpers import CAMERAS, network, product, refused, side_of
+from helpers import CAMERAS, network, product, products, refused, side_of, slow_but
 from torch._dynamo.testing import CompileCounter
 
 from darswin import create_model, list_models, optimize
@@ -33,6 +33,7 @@ NANO_UNETS = [name for name in NANOS if name not in ENCODERS]
 WITH_VIEWS = ("swin_nano perspective", "swin_unet_nano perspective", "swin_unet_nano square")
 IGNORE_THE_LENS = ("swin_nano", "swin_unet_nano", "dat_nano")
 ONE_OF_EACH_KIND = ("darswin_a_nano", "swin_nano", "darswin_unet_a_nano", WITH_VIEWS[1])
+IN_GRAPHS = ("darswin_unet_ra_nano", "dat_nano", "swin_unet_nano", "conv_unet_nano")
 CASES = {name: (name, {}) for name in NANOS} | {
     case: (case.split()[0], dict(view=case.split()[1])) for case in WITH_VIEWS
 } | {
@@ -641,7 +642,7 @@ def no_graphs_before_or_after():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_graphs_before_or_after")
-@nanos
+@pytest.mark.parametrize("name", slow_but(NANOS, *IN_GRAPHS, marks=products))
 def test_one_graph_at_any_batch_size_with_the_same_results(name):
     model, _, _ = made(name, drop_path_rate=0.1)
     model.set_grad_checkpointing()  # without effect: in a graph the compiler decides this
@@ -662,7 +663,9 @@ def test_one_graph_at_any_batch_size_with_the_same_results(name):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_graphs_before_or_after")
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano perspective"])
+@pytest.mark.parametrize(
+    "name", slow_but(["darswin_a_nano", "swin_nano perspective"], "darswin_a_nano", marks=products)
+)
 def test_a_compiled_training_step_with_the_default_backend(name):
     options = dict(jitter=0.0) if name.startswith("darswin") else {}
     # Compiling a single block takes seconds.

@@ -6,7 +6,7 @@ import signal
 from contextlib import nullcontext
 
 import pytest
-from helpers import slow_but
+from helpers import in_turn, slow_but
 from runs import DIGITS, assert_same, checkpoint, fit, patch_batch
 
 from darswin.train.classification import Classification
@@ -73,8 +73,9 @@ def wholes(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["steps", "time", "signal"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "how"), in_turn([(case,) for case in CASES], ["steps", "time", "signal"])
+)
 def test_a_run_that_stops_at_every_step_ends_as_a_whole_one(
     wholes, tmp_path, monkeypatch, case, how
 ):

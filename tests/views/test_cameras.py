@@ -372,3 +372,13 @@ def test_gradients_reach_both_lenses_also_at_the_centre_and_where_nothing_is_see
     there = places(*tensors)
     assert (there == OUTSIDE).any() and (there[0, 4, 4] != OUTSIDE).all()
     assert torch.autograd.gradcheck(places, tensors, fast_mode=True)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_rays_of_another_camera_come_back_to_its_points(turn):
+    view = CameraView(TARGETS[0], turn=turn)
+    points = 20 + 88 * torch.rand(50, 2)
+    rays = view.to_rays(points, LENSES["circle"], SIZE)
+    assert not rays.isnan().any()
+    back = view.to_points(rays, LENSES["circle"], SIZE)
+    torch.testing.assert_close(back, points, rtol=0, atol=1e-3)
