@@ -134,21 +134,17 @@ def test_presets_and_a_run_s_own_configuration(tmp_path, capsys):
     assert complete(["test", *run])[1] == "classification"
 
 
-def test_the_paper_s_preset_holds_the_recipe():
-    preset = yaml.safe_load((PRESETS / "iccv2023.yaml").read_text())
-    model, data = preset["model"], preset["data"]
-    assert preset["trainer"] == {"max_epochs": 600, "gradient_clip_val": 5.0}
-    assert (model["learning_rate"], model["warmup_rate"], model["final_rate"]) == (5e-4, 5e-7, 5e-6)
-    assert (model["warmup_epochs"], model["weight_decay"]) == (20, 0.05)
-    assert (model["mixup"], model["cutmix"], model["label_smoothing"]) == (0.8, 1.0, 0.1)
-    assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
-
-
-def test_the_paper_s_own_rate_is_the_only_difference_of_its_preset():
+def test_the_presets_of_the_paper_hold_its_recipe_and_its_own_rate():
     code, paper = (
         yaml.safe_load((PRESETS / f"{name}.yaml").read_text())
         for name in ("iccv2023", "iccv2023_paper")
     )
+    model, data = code["model"], code["data"]
+    assert code["trainer"] == {"max_epochs": 600, "gradient_clip_val": 5.0}
+    assert (model["learning_rate"], model["warmup_rate"], model["final_rate"]) == (5e-4, 5e-7, 5e-6)
+    assert (model["warmup_epochs"], model["weight_decay"]) == (20, 0.05)
+    assert (model["mixup"], model["cutmix"], model["label_smoothing"]) == (0.8, 1.0, 0.1)
+    assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
     rates = ("learning_rate", "warmup_rate", "final_rate")
     code_at_128 = {rate: code["model"].pop(rate) * 128 / 512 for rate in rates}
     at_128 = {rate: paper["model"].pop(rate) for rate in rates}

@@ -252,10 +252,8 @@ def test_a_second_run_goes_on(flat, capsys):
     for picture, (changed, content) in before.items():
         assert picture.read_bytes() == content
         assert (picture.stat().st_mtime_ns == changed) == (picture != pictures[1])
-    assert refused(capsys, flat, FLAT, "--size 9,9") == (
-        "darswin: --out out holds other files: give a new or an empty folder, or one of an "
-        "earlier run of the same command with the same calibrations, which then goes on"
-    )
+    said = refused(capsys, flat, FLAT, "--size 9,9")
+    assert "one of an earlier run of the same command with the same calibrations" in said
 
 
 @pytest.mark.parametrize(
@@ -397,12 +395,6 @@ def test_a_view_that_sees_nothing_of_the_lens(flat, capsys, monkeypatch):
     assert all(f"{k}.png: this view sees nothing of the lens" in said for k in range(3))
 
 
-def test_no_things_at_all(flat, capsys):
-    file = warp(edited(flat, lambda content: content["annotations"].clear()), WIDE)
-    assert "3 pictures of 3, with 0 things" in capsys.readouterr().out
-    assert json.loads(file.read_text())["annotations"] == []
-
-
 def test_many_errors_are_counted(capsys):
     source = write_set(Path("in"), 12)
     for picture in Path("in/images").iterdir():
@@ -411,25 +403,24 @@ def test_many_errors_are_counted(capsys):
     assert said.count("cannot read") == 10 and said.endswith("and 2 more")
 
 
-@pytest.mark.parametrize("to", [WIDE, "tiles:4"])
-def test_grey_pictures_stay_grey(to):
-    source = write_set(Path("in"), 1)
-    grey = cv2.imread("in/images/0.png", cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite("in/images/0.png", grey)
-    warp(source, to)
+@pytest.mark.parametrize(("to", "count"), [(WIDE, 1), ("tiles:4", 4)])
+def test_grey_pictures_without_things(to, count, capsys):
+    source = edited(write_set(Path("in"), 1), lambda content: content["annotations"].clear())
+    grey = cv2.imread("images/0.png", cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite("images/0.png", grey)
+    file = warp(source, to)
+    assert f"{count} pictures of 1, with 0 things" in capsys.readouterr().out
+    assert json.loads(file.read_text())["annotations"] == []
     for new in Path("out/images").iterdir():
         assert cv2.imread(str(new), cv2.IMREAD_UNCHANGED).ndim == 2
 
 
 def test_where_labels_and_pictures_are(flat, monkeypatch):
-    """In a folder with a COCO file, in a folder that is given, and in the current one."""
+    """In a folder with a COCO file, and in the current one; the contract has --pictures."""
     Path("set/annotations").mkdir(parents=True)
     Path("set/images").symlink_to(flat.parent / "images")
     Path("set/annotations/instances.json").write_text(flat.read_text())
     assert len(read_coco(warp("set", WIDE))) == 3
-    Path("labels.json").write_text(flat.read_text())
-    warp("labels.json", WIDE, "--pictures set/images", out="2")
-    assert len(list(Path("2/images").iterdir())) == 3
-    out = Path("3").absolute()
+    out = Path("2").absolute()
     monkeypatch.chdir(flat.parent)
     assert len(read_coco(warp("instances.json", WIDE, out=out))) == 3
