@@ -36,6 +36,7 @@ REFUSED = {
         p.png --model digits --run . => or --model, a safetensors file or one of digits
         p.png --model digits => missing --lens: give the camera
         p.png --model digits --view mercator => --view is an option of --network, an ONNX file
+        p.png --model digits --labels l.txt => --labels is an option of --network
         --lens lens.json --run . => missing pictures or videos
         checkpoints --run . --lens lens.json => no pictures or videos in checkpoints
         x.png --calib_lenses x --evry 2 => the nearest option is --every; see
@@ -62,6 +63,7 @@ REFUSED = {
         --network n.onnx => missing --lens
         --network n.onnx --lens lens.json => missing --out
         --network n.onnx --model digits => give either --run, .* or --network, an ONNX file
+        --network n.onnx --run r => give either --run, .* or --network, an ONNX file
         --network n.onnx --channels grb => --channels must be one of rgb, bgr, got grb
         --network n.onnx --fov_deg wide => --fov_deg must be a number, got wide
     """,
@@ -78,6 +80,7 @@ REFUSED = {
         n.onnx --std 58.395,57.12,57.375 => parts of 255, .* 0.229,0.224,0.225\), got 58.395
         n.onnx --mean 0.1,0.2 => mean.*per channel
         n.onnx --std 0 => --std must be above 0
+        n.onnx --std nan => --std must be finite, got nan
         n.onnx --top 2 => --top is for the classes of pictures, but n.onnx is a model
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be finite, got nan
@@ -133,6 +136,7 @@ REFUSED = {
         crop front.json new.json --box 0,0,0,9 => --box must be from 1 to 1000000 px, got 0
         crop front.json new.json => missing --box or --size
         crop front.json new.json --box=966,0,9,9 => --box must be a part of the picture of 1280 × 9
+        crop front.json new.json --box=0,-9,9,9 => --box must be a part of the picture
         crop front.json new.json --box=1,2,3 => --box must be 4 whole numbers
         crop bare.json new.json --image_size 0,9 --size 9,9 => --image_size must be from 1 to 1000
     """,
@@ -143,6 +147,7 @@ REFUSED = {
         --view=panorama --fov_deg=90 => --fov_deg must be 360° for a panorama view, got 90
         --view=square --pitch_deg=9 => --pitch_deg must be 0 for a square view, which
         --up=0,0,0 => --up must be three finite .*, got \(0.0, 0.0, 0.0\)
+        --up=0,1e999,2 => --up must be three finite numbers
         --yaw_deg=inf => --yaw_deg must be from -360° to 360°, got inf
         --theta_max_deg=0 => --theta_max_deg must be above 0° and at most 180°, got 0
         --rings=100000000 => --rings must be from 1 to 1024, got 100000000
@@ -155,12 +160,14 @@ REFUSED = {
         in --view=square --up=0,-1,0 --out=out => --up must be left out for a square view
         in --view=fisheye --out=out => --view must be one of cylindrical, equirectangular
         in --theta_max_deg=0 --out=out => --theta_max_deg must be above 0°
+        in --size=0,9 --out=out => --size must be at least 2,2
         in --size=100000,100000 --out=out => --size must be at least 2,2 and at most
         in --view=square --size=40,41 --out=out => --size must be square for this view
         --out=out => missing pictures or videos
         nothing --out=out => there is no file or folder nothing$
         in --out=/proc/x => --out must be a folder that can be written, got /proc/x
         in --out=. => --out must be a folder without the originals, but has in
+        in --out=in => --out must be a folder without the originals, but has in
         in/p.png --out=in => --out must be a folder without the originals, but has in/p.png
         in out/p.png --out=out => must be a folder without the originals, but has out/p.png
         more --out=more/own => no pictures or videos in more, apart from those of --out
@@ -186,6 +193,7 @@ REFUSED = {
         boards --dictionary=4X4_50 => --kind chessboard has no --dictionary
         boards --kind=charuco --marker=0.1 => --marker must be below the square of 0.03
         boards --kind=charuco --marker=0.02 --gap=0.1 => --kind charuco has no --gap
+        boards --kind=charuco --marker=0.02 --first_tag=3 => --kind charuco has no --first_tag
         boards --kind=charuco --marker=0.02 --dictionary=4X4_5 => did you mean 4X4_50\?
         boards --model=KanalaBrandt => --model: .*did you mean KannalaBrandt
         boards --picture=made.gif => must end in one of .png
@@ -220,6 +228,8 @@ REFUSED = {
         --config two_cores --task distance => distance, which has scenes_minutes
         --model darswin_a_small => is none; type --model.name darswin_a_small; `darswin fit --help`
         --model=darswin_a_small => darswin: --model takes a file of options, and darswin_a_small is
+        --data photos => type --data.path photos; `darswin fit --help` lists the options
+        --trainer 3 => --trainer takes a file of options, and 3 is none; `darswin fit
     """,
     "fit --config minutes --data.path digits --run": r"""
         => ^darswin fit: argument --run: expected one argument; see `darswin fit --help`$
