@@ -57,6 +57,21 @@ def paired_iou(a, b):
     return np.diagonal(boxes.iou(a, b))
 
 
+def test_the_half_pixel():
+    """A mirrored picture of 10 px: the pixel 0 becomes the pixel 9, the border 0 the border 10."""
+
+    def mirror(points):
+        return np.stack((9 - points[..., 0], points[..., 1]), -1)
+
+    carried, _ = boxes.carry([[0, 0, 4, 2]], mirror)
+    np.testing.assert_allclose(carried, [[6, 0, 10, 2]], atol=1e-12)
+    np.testing.assert_allclose(boxes.carry_points([[0.5, 0.5]], mirror), [[9.5, 0.5]])
+    mask = np.zeros((2, 10), bool)
+    mask[:, :4] = True
+    carried_mask = boxes.carry_mask(mask, mirror, mask.shape)
+    assert np.flatnonzero(carried_mask[0]).tolist() == [6, 7, 8, 9]
+
+
 FLAT = Perspective(focal=215.0, theta_max=1.2, image_size=(512, 512))
 WIDE = Equidistant(193.0, 1.65, image_size=(240, 640))
 NARROW = Equidistant(200.0, 0.6, image_size=(256, 256))

@@ -242,6 +242,8 @@ def test_a_lens_whose_axis_is_outside_of_the_picture(name):
     images, view = torch.ones(2, 1, *SIZE), make_view(name, (32, 96))
     if not view.around:
         refused("sees nothing of the lens: .*View.* of Kannala", view, images[:1], beside)
+        behind = make_view(name, (8, 8), direction=(0, 0, -1), fov=1.0)
+        refused("sees nothing of the lens", behind.prepare, Perspective(500.0, 0.5), SIZE)
     both = WIDE[[0, 0]].replace(center=torch.cat((WIDE.center_in(), beside.center_in())))
     back = view.back(torch.ones(2, 1, 32, 96), view.prepare(both, SIZE))
     assert back.isfinite().all() and view.ray_channels(both, SIZE).isfinite().all()
