@@ -54,7 +54,7 @@ class CMakeBuild(build_ext):
              f"-DDARSWIN_PYTHONS={pythons()}",
              f"-DDARSWIN_OUTPUT_DIR={output}",
              f"-DDARSWIN_SANITIZE={sanitize}",
-             f"-DDARSWIN_ONLY_TIER={os.environ.get('DARSWIN_ONLY_TIER', '')}"]
+             f"-DDARSWIN_ONLY_TIERS={os.environ.get('DARSWIN_ONLY_TIERS', '.*')}"]
         )  # fmt: skip
         subprocess.check_call(["cmake", "--build", build])
 

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.curves import Tabulated, as_curves, cat
@@ -260,11 +259,15 @@ class Packing:
 def slopes_of(function: Callable[[Tensor], Tensor], vector: Tensor) -> Tensor:
     """(..., n): the derivatives of a function by the numbers of a vector (n,). The function takes
     vectors (n, n), one for each derivative, and gives (n, ...)."""
-    count = len(vector)
-    with forward_ad.dual_level():  # torch.func.jacfwd takes much longer
-        axes = torch.eye(count, dtype=vector.dtype)
-        values = function(forward_ad.make_dual(vector.repeat(count, 1), axes))
-        return forward_ad.unpack_dual(values).tangent.movedim(0, -1)
+    # Twice backward. Forward, a product with a constant takes torch 40 times as long: it asks Python
+    # for the shape of the derivative of the constant.
+    with torch.enable_grad():
+        vectors = vector.repeat(len(vector), 1).requires_grad_()
+        values = function(vectors)
+        weights = torch.zeros_like(values, requires_grad=True)
+        (back,) = torch.autograd.grad(values, vectors, weights, create_graph=True)
+        (slopes,) = torch.autograd.grad(back, weights, torch.eye(len(vector)).to(vector))
+    return slopes.movedim(0, -1)
 
 
 def _least_squares(

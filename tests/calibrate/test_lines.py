@@ -54,8 +54,8 @@ def curves_of(
         points = torch.from_numpy(rng.normal(size=3) * 2 + along)
         pixels = lens.project_points(points[None])[0].numpy()
         seen = ((pixels > -0.5) & (pixels < np.array(SIZE[::-1]) - 0.5)).all(1)
-        last = np.nonzero(~seen)[0]
-        pixels = pixels[seen] if not len(last) else max(np.split(pixels, last), key=len)[1:]
+        ends = np.flatnonzero(np.diff(np.r_[False, seen, False]))
+        pixels = pixels[slice(*max(ends.reshape(-1, 2), key=np.ptp, default=(0,)))]
         if len(pixels) < 2:
             continue
         steps = np.r_[0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
