@@ -32,6 +32,7 @@ def write_stripes(folder, **counts):
 
 
 @pytest.mark.slow
+@pytest.mark.products
 def test_the_preset_few_learns_96_pictures_that_two_cores_does_not(tmp_path):
     pictures = write_stripes(tmp_path / "stripes", train=20, val=4, test=20)
     right = {}

@@ -274,7 +274,7 @@ def test_a_network_gives_the_same_however_it_runs(case, lens, tmp_path):
 @pytest.mark.slow
 @pytest.mark.unsanitized
 @pytest.mark.parametrize(
-    "family", slow_but(FAMILIES, "darswin_unet_ra", "dat", "conv_unet", marks=products)
+    "family", slow_but(FAMILIES, "darswin_unet_ra", marks=products)
 )
 def test_so_do_the_large_sizes(family, tmp_path):
     check((family, dict(size="small")), *LENSES["round"], tmp_path)

@@ -41,6 +41,7 @@ def test_equals_the_reference_in_float64(case):
     assert_equal_results(results(made, masked=False), expected, 1e-11)
 
 
+@pytest.mark.unsanitized  # it calls what the next test calls
 @every_case
 def test_accuracy_rule(case):
     # With few numbers, more draws are needed to measure rounding. For 900 sums of 576 products, the

@@ -97,6 +97,7 @@ class Colour(nn.Module):
 
 
 @pytest.mark.slow
+@pytest.mark.products
 def test_the_study_runs_once_and_is_collected_again(made_up, tmp_path, monkeypatch):
     few = {name: pretrained_methods.LEVEL_METHODS[name] for name in ("raw", "mercator", "tiles: 5")}
     splits = "level", "small", "down", "perspective"

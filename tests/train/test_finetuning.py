@@ -49,6 +49,7 @@ def classifier(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.products
 def test_fine_tuning_beats_a_fresh_start(tmp_path):
     data = write_frames(tmp_path / "frames", count=900, classes="012345")
     base, minutes = tmp_path / "base", ["--config", "minutes", "--data.size", "32"]
