@@ -19,8 +19,10 @@ from darswin.models.registry import model_class
 from darswin.utils.malloc import keep_freed_memory
 from darswin.utils.parameters import check
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-INT8 = {"int8": torch.int8}  # inference, where the CPU has it
+DTYPES = {
+    "inference": {"float32": torch.float32, "int8": torch.int8},
+    "training": {"float32": torch.float32, "bfloat16": torch.bfloat16},
+}
 MOST = 65536  # px, and images at once
 LATENCY_RUNS = 100  # at batch 1, for a 99th percentile
 # The largest relative difference of two candidates' results.
@@ -62,7 +64,7 @@ def bench(
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     timings: list[Timing] = []
     for mode in ("inference", "training"):
-        for dtype in _dtypes(mode):
+        for dtype in DTYPES[mode]:
             for batch in batches:
                 for threads in THREADS:
                     with_compiled = batch in compiled and threads == max(THREADS)
@@ -88,11 +90,11 @@ def _measure(
 ) -> list[Timing]:
     threads = torch.get_num_threads()
     case = Case(model, f"{size}×{size}", batch, threads, f"{mode}, {dtype}")
+    kind = DTYPES[mode][dtype]
     if mode == "inference":
-        kind = (DTYPES | INT8)[dtype]
         runs = candidates.inference(model, size, kind, batch, compiled=compiled)
     else:
-        runs = candidates.training(model, size, DTYPES[dtype], batch)
+        runs = candidates.training(model, size, kind, batch)
     _check(runs, TOLERANCES[dtype])
     least = LATENCY_RUNS if mode == "inference" and batch == 1 else TURNS
     wanted = targets.of_model(case) if threads == max(THREADS) else None
@@ -100,10 +102,6 @@ def _measure(
     times = ", ".join(f"{t.name} {1e3 * t.median:.1f} ms" for t in found)
     print(f"{mode}, {dtype}, batch {batch}, {threads} threads: {times}", flush=True)
     return found
-
-
-def _dtypes(mode: str) -> list[str]:
-    return [*DTYPES, *(INT8 if mode == "inference" else ())]
 
 
 def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:
@@ -124,8 +122,9 @@ def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:
 def _memory(model: str, size: int, batch: int) -> list[memory.Memory]:
     return [
         memory.measure(mode, model, size, dtype, batch, name, max(THREADS))
-        for mode in ("inference", "training")
-        for dtype in DTYPES
+        for mode, dtypes in DTYPES.items()
+        for dtype in dtypes
+        if dtype != "int8"
         for name in (OURS, REFERENCE)
     ]
 

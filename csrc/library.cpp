@@ -36,7 +36,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_to_image_backward(" POLAR_TO_IMAGE
         ", bool tokens, Tensor? plan, Tensor grad_out, bool x_grad, bool lens_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
-  m.def("_add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
   m.def(
       "_pack_linear(Tensor weight, Tensor? bias, Tensor? weight_scale=None, float scale=1.0, "
       "int zero_point=0) -> Tensor");

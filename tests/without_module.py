@@ -49,7 +49,7 @@ def main() -> None:
     from darswin.cli.info import facts
 
     found = facts()
-    assert found["tier"].startswith("the PyTorch reference: ") and "fastest" not in found
+    assert found["tier"].startswith("the PyTorch reference: ") and "int8" not in found
     assert "without its compiled module" in found["darswin"]
 
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import Own, best_seconds, library_of, onednn_linear
+from darswin.deploy.own import own_linear
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
@@ -47,35 +47,32 @@ def inference(
 
     The matrix products alone are those of the linear layers, one after the other, each by the
     library that computes it fastest: the roofline of a model on this machine. A model of 8 bits
-    takes turns with itself in float32 and, where the CPU has it, bfloat16; its reference is one of
-    float32.
+    takes turns with itself in float32; its reference is one of float32, which is also compiled in
+    bfloat16 where the CPU has it.
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
-    ours = quantize_model(model, [(images, lens)]) if dtype == torch.int8 else model
+    has_8_bits = dtype == torch.int8
+    ours = quantize_model(model, [(images, lens)]) if has_8_bits else model
     ours_of_lens = optimize(ours, dtype, lens=lens)
-    products = matmuls_of(ours, images, lens, dtype)
-    theirs = [dtype]
-    if dtype == torch.int8:
-        half = onednn_lack(torch.bfloat16) is None
-        theirs = [torch.float32, torch.bfloat16] if half else [torch.float32]
-    peers = [(copy.deepcopy(model).to(kind), images.to(kind)) for kind in theirs]
-    peer, pixels = peers[0]
+    products = matmuls_of(ours, images, lens)
     runs: dict[str, Run] = {
         timing.OURS: optimized_run(ours, lens, dtype, images),
         timing.FIXED_LENS: lambda: ours_of_lens(images),
         timing.MATMULS: lambda: _all(products),
-        timing.REFERENCE: reference_run(peer, lens, pixels),
+        timing.REFERENCE: reference_run(model, lens, images),
     }
-    if dtype == torch.int8:
-        for name, kind in zip((timing.OURS_FLOAT32, timing.OURS_BFLOAT16), theirs, strict=False):
-            runs[name] = optimized_run(model, lens, kind, images)
+    if has_8_bits:
+        runs[timing.OURS_FLOAT32] = optimized_run(model, lens, torch.float32, images)
     if compiled:
         torch._dynamo.reset()
-        names = (timing.COMPILED, timing.COMPILED_BFLOAT16)
-        for name, (peer, pixels) in zip(names, peers, strict=False):
+        kinds = {timing.COMPILED: torch.float32}
+        if has_8_bits and torch.ops.mkldnn._is_mkldnn_bf16_supported():
+            kinds[timing.COMPILED_BFLOAT16] = torch.bfloat16
+        for name, kind in kinds.items():
+            peer = copy.deepcopy(model).to(kind)
             graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
-            runs[name] = reference_run(graph, lens, pixels)
+            runs[name] = reference_run(graph, lens, images.to(kind))
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
@@ -92,8 +89,7 @@ def optimized_run(model: Model, lens: Lens, dtype: torch.dtype, images: Tensor) 
 
 
 def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> Run:
-    """Inference with the PyTorch reference. In bfloat16, casting weights and images is faster than
-    autocast."""
+    """Inference with the PyTorch reference."""
 
     def run() -> Tensor:
         with use_reference():
@@ -103,43 +99,40 @@ def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> R
 
 
 def matmuls_of(
-    model: Model, images: Tensor, lens: Lens, dtype: torch.dtype
+    model: Model, images: Tensor, lens: Lens
 ) -> list[tuple[Callable[[Tensor], Tensor], Tensor]]:
-    """The linear layers that a model runs, each with an input, computed by the fastest library.
-
-    With int8, the layers that are not quantized are float32.
-    """
-    rest = torch.float32 if dtype == torch.int8 else dtype
+    """The linear layers that a model runs, each with an input, computed by the fastest library."""
     found: list[tuple[Callable[[Tensor], Tensor], Tensor]] = []
     fastest: dict[tuple[type, int, int, int], str] = {}
     for layer, rows in products_of(model, images, lens):
-        x = torch.randn(rows, layer.in_features).to(rest)
+        x = torch.randn(rows, layer.in_features)
         if isinstance(layer, QuantizedLinear):
             x = quantize(x, layer.activation)
-        libraries = _libraries(layer, rest)
+        libraries = _libraries(layer)
         shape = (type(layer), rows, layer.in_features, layer.out_features)
         if shape not in fastest:
             with torch.inference_mode():
                 runs = {name: partial(run, x) for name, run in libraries.items()}
-                seconds = best_seconds(runs, turns=5)
-            fastest[shape] = min(seconds, key=seconds.__getitem__)
+                fastest[shape] = timing.fastest(runs, turns=5)
         found.append((libraries[fastest[shape]], x))
     return found
 
 
-def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], Tensor]]:
-    """One linear layer by each library that computes it, in `dtype` or as it is quantized."""
+def _libraries(layer: Any) -> dict[str, Callable[[Tensor], Tensor]]:
+    """One linear layer by each library that computes it, in float32 or as it is quantized."""
     if isinstance(layer, QuantizedLinear):
-        return {"darswin": Own().linear(layer)}
-    weight = layer.weight.detach().to(dtype)
-    bias = None if layer.bias is None else layer.bias.detach().to(dtype)
-    ours = library_of(dtype).linear(layer)
+        return {"darswin": own_linear(layer)}
+    weight = layer.weight.detach()
+    bias = None if layer.bias is None else layer.bias.detach()
     libraries: dict[str, Callable[[Tensor], Tensor]] = {
-        "darswin": ours,
+        "darswin": own_linear(layer),
         "torch": lambda x: F.linear(x, weight, bias),
     }
-    if onednn_lack(dtype) is None:
-        libraries["onednn"] = onednn_linear(weight, bias)
+    if onednn_lack() is None:
+        # oneDNN keeps the weight in its own layout.
+        packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+        product = torch.ops.mkldnn._linear_pointwise.default
+        libraries["onednn"] = lambda x: product(x, packed, bias, "none", [], "")
     return libraries
 
 
@@ -173,8 +166,7 @@ def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, 
     library that computes them faster.
     """
     products = {b: training_products(name, size, dtype, batch, b) for b in MATMUL_BACKENDS}
-    seconds = best_seconds(products, turns=3)
-    backend = min(seconds, key=seconds.__getitem__)
+    backend = timing.fastest(products, turns=3)
     return {
         timing.OURS: training_step(name, size, dtype, batch, backend),
         timing.REFERENCE: training_step(name, size, dtype, batch, None),

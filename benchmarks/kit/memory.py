@@ -86,7 +86,7 @@ def _measure_here(
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)
         if reference:
-            run = candidates.reference_run(net.to(kind), lens, images.to(kind))
+            run = candidates.reference_run(net, lens, images)
         else:
             run = candidates.optimized_run(net, lens, kind, images)
         run = torch.no_grad()(run)

@@ -12,7 +12,6 @@ from kit.timing import (
     FIXED_LENS,
     MATMULS,
     OURS,
-    OURS_BFLOAT16,
     OURS_FLOAT32,
     REFERENCE,
     Timing,
@@ -81,7 +80,7 @@ def models_table(timings: Sequence[Timing]) -> str:
 
 def quantized_table(timings: Sequence[Timing]) -> str:
     """The times in other types over that with 8 bits: a row for each batch size."""
-    peers = (OURS_FLOAT32, OURS_BFLOAT16, COMPILED, COMPILED_BFLOAT16)
+    peers = (OURS_FLOAT32, COMPILED, COMPILED_BFLOAT16)
     rows = [
         [f"batch {batch}", *(ratios(found.get(peer, ()), 2) for peer in peers)]
         for (_, batch, mode), found in by_case(timings).items()

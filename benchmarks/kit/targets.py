@@ -9,7 +9,6 @@ from kit.timing import (
     COMPILED_BFLOAT16,
     MATMULS,
     OURS,
-    OURS_BFLOAT16,
     OURS_FLOAT32,
     REFERENCE,
     Case,
@@ -21,10 +20,8 @@ MODEL, SETTING = "darswin_a_small", "64×64"
 MODEL_TARGETS = {
     ("inference, float32", 8): {REFERENCE: 2.6, COMPILED: 2.2, MATMULS: 0.8},
     ("inference, float32", 1): {REFERENCE: 2.2},
-    ("inference, bfloat16", 8): {REFERENCE: 1.35, COMPILED: 1.1},
     ("inference, int8", 8): {
         OURS_FLOAT32: 2.3,
-        OURS_BFLOAT16: 1.6,
         COMPILED: 1.6,
         COMPILED_BFLOAT16: 1.6,
         MATMULS: 0.7,

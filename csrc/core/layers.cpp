@@ -60,18 +60,17 @@ void multiply_tokens(const X* x, int64_t rows, const Layer& layer, void* out, Af
 
 template <typename Out>
 void normalize_rows(const float* x, int64_t rows, const Norm& norm, Out* out, Quantizer quantizer) {
-  // Without a second summand, the kernel only reads x.
-  const AddNormArgs<float, Out> args{.x = const_cast<float*>(x),
-                                     .out = out,
-                                     .weight = norm.parameters,
-                                     .bias = norm.parameters + norm.dim,
-                                     .eps = norm.eps,
-                                     .width = norm.dim,
-                                     .quantizer = quantizer};
+  const NormArgs<Out> args{.x = x,
+                           .out = out,
+                           .weight = norm.parameters,
+                           .bias = norm.parameters + norm.dim,
+                           .eps = norm.eps,
+                           .width = norm.dim,
+                           .quantizer = quantizer};
   constexpr double kPerMicrosecond = 4000;  // numbers
   const Threads threads = threads_for(static_cast<double>(rows) * norm.dim / kPerMicrosecond);
   parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
-    kernels<AddNormKernels<float, Out>>().rows(args, begin, end);
+    kernels<NormKernels<Out>>().rows(args, begin, end);
   });
 }
 

@@ -2,8 +2,8 @@
 // Nothing here uses torch. Nothing is checked: the callers keep memory safe.
 #pragma once
 
-#include "../add_norm.h"
 #include "../linear.h"
+#include "../norm.h"
 #include "../window_attention.h"
 
 namespace darswin {

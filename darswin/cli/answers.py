@@ -294,11 +294,11 @@ def write_overlay(out: Path, name: str, picture: np.ndarray) -> str:
 
 
 def fast(model: Net, card: ModelCard) -> Net:
-    """The model optimized in float32; a quantized model in the fastest type. Without the compiled
-    module, the model itself."""
+    """The optimized model, with 8 bits if it is quantized. Without the compiled module, the model
+    itself."""
     if _module.LACK is not None:
         return model.eval()
-    return optimize(model, "fastest" if card.quantized else torch.float32)
+    return optimize(model, torch.int8 if card.quantized else torch.float32)
 
 
 def framing_of(net: Model, card: ModelCard) -> Fit:

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import fastest_dtype
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.models import create_model, list_models
@@ -73,19 +72,12 @@ def facts() -> dict[str, str]:
     }
     if lack is not None:
         lines["tier"] = f"the PyTorch reference: {lack}"
-    for dtype in (torch.float32, torch.bfloat16):
-        reason = onednn_lack(dtype)
-        lines[_name(dtype)] = "oneDNN" if reason is None else f"torch: {reason}"
+    lines["oneDNN"] = onednn_lack() or "in torch"
     if lack is None:
         lines["int8"] = f"darswin, {BYTE_PRODUCTS[_module.byte_products()]}"
-        lines["fastest"] = f"int8 for quantized models, else {_name(fastest_dtype())}"
     for extra in EXTRAS:
         lines[f"[{extra}]"] = extras.lack(extra) or "installed"
     return lines
-
-
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
 
 
 def cpu() -> str:

@@ -38,7 +38,7 @@ def quantize(
     pictures, through the lenses of training. The parts that change the result most stay in float32.
     The command prints how much the results
     change on validation pictures. `darswin predict --model FILE` and
-    `darswin.optimize(model, "fastest")` run the file.
+    `darswin.optimize(model, torch.int8)` run the file.
 
     Args:
         run: the folder of a run of `darswin fit`.

@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from darswin.deploy.own import OwnLinear, OwnNorm, pack
-from darswin.deploy.packed import InDtype, Layer, Own, OwnBlocks, refuse_gradients
+from darswin.deploy.own import OwnLinear, OwnNorm, own_linear, pack
+from darswin.deploy.packed import InFloat32, blocks_of, refuse_gradients
+from darswin.deploy.program import Weights
 from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
@@ -18,31 +18,27 @@ from darswin.models.conv_unet import ConvBlock
 from darswin.models.unet import Unet
 from darswin.views import PolarGrid
 
-# A stage processes a large batch in parts. A part is so small that the tensors between two products
-# stay below this size: in the caches, and in memory that the allocator reuses.
-CACHED_BYTES = 16 * 2**20
-
 
 @singledispatch
-def fast(layer: nn.Module, library: Own) -> nn.Module:
+def fast(layer: nn.Module, weights: Weights) -> nn.Module:
     """The layer that takes the place of another one. A kind of layer that is not registered here
     stays, with fast layers in it."""
     for name, part in layer.named_children():
-        layer.add_module(name, fast(part, library))
+        layer.add_module(name, fast(part, weights))
     return layer
 
 
 @fast.register
-def _(unet: Unet, library: Own) -> nn.Module:
+def _(unet: Unet, weights: Weights) -> nn.Module:
     for part in (unet.encoder, unet.decoder, unet.head):  # the places of tokens stay in float32
-        fast(part, library)
+        fast(part, weights)
     return unet
 
 
 class FastLayer(nn.Module):
-    """A layer of a `library`."""
+    """A layer of our own operators."""
 
-    def __init__(self, layer: Layer):
+    def __init__(self, layer: OwnLinear | OwnNorm):
         super().__init__()
         self.layer = layer
 
@@ -51,29 +47,28 @@ class FastLayer(nn.Module):
 
 
 @fast.register
-def _(linear: nn.Linear, library: Own) -> nn.Module:
-    return FastLayer(library.linear(linear))
+def _(linear: nn.Linear, weights: Weights) -> nn.Module:
+    return FastLayer(own_linear(linear))
 
 
 @fast.register
-def _(layer: QuantizedLinear, library: Own) -> nn.Module:
+def _(layer: QuantizedLinear, weights: Weights) -> nn.Module:
     raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
 
 
 @fast.register
-def _(norm: nn.LayerNorm, library: Own) -> nn.Module:
-    return FastLayer(library.norm(norm))
+def _(norm: nn.LayerNorm, weights: Weights) -> nn.Module:
+    return FastLayer(OwnNorm(norm))
 
 
 @fast.register
-def _(conv: nn.Conv2d, library: Own) -> nn.Module:
-    return InDtype(conv, library.dtype)
+def _(conv: nn.Conv2d, weights: Weights) -> nn.Module:
+    return InFloat32(conv)
 
 
 @fast.register
-def _(layer: PatchProjection, library: Own) -> nn.Module:
-    own = library.dtype == torch.float32
-    return FastProjection(layer) if own else InDtype(layer, library.dtype)
+def _(layer: PatchProjection, weights: Weights) -> nn.Module:
+    return FastProjection(layer)
 
 
 class FastProjection(nn.Module):
@@ -97,10 +92,10 @@ class FastProjection(nn.Module):
 
 
 @fast.register
-def _(block: ConvBlock, library: Own) -> nn.Module:
+def _(block: ConvBlock, weights: Weights) -> nn.Module:
     conv1, norm1, _, conv2, norm2, _ = list[Any](block)
     fused = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
-    first, second = (InDtype(conv, library.dtype) for conv in fused)
+    first, second = (InFloat32(conv) for conv in fused)
     return nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
 
 
@@ -108,25 +103,23 @@ def _(block: ConvBlock, library: Own) -> nn.Module:
 class FastEmbed(nn.Module):
     """The embedding of samples, in float32."""
 
-    def __init__(self, embed: PolarPatchEmbed, library: Own):
+    def __init__(self, embed: PolarPatchEmbed, weights: Weights):
         super().__init__()
-        own = Own(library.weights)
-        self.proj, self.norm = own.linear(embed.proj), own.norm(embed.norm)
-        self.dtype = library.dtype
+        self.proj, self.norm = own_linear(embed.proj), OwnNorm(embed.norm)
 
     def forward(self, x: Tensor) -> Tensor:
         refuse_gradients(x)
-        return self.norm(self.proj(x.float())).to(self.dtype)
+        return self.norm(self.proj(x.float()))
 
 
 @fast.register(PatchMerging)
 class FastMerging(PatchMerging):
-    """The merging of tokens, with the norm and the product of a library."""
+    """The merging of tokens, with our own norm and product."""
 
-    def __init__(self, merging: PatchMerging, library: Own):
+    def __init__(self, merging: PatchMerging, weights: Weights):
         nn.Module.__init__(self)
         self.merge = merging.merge
-        self.product = library.linear(merging.reduction, merging.norm)
+        self.product = own_linear(merging.reduction, merging.norm)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.product(self.joined(x))
@@ -134,20 +127,15 @@ class FastMerging(PatchMerging):
 
 @fast.register(Stage)
 class FastStage(nn.Module):
-    """A stage whose blocks a library computes, in parts if the batch is large. Our own operator
-    takes parts itself."""
+    """A stage, its blocks by one operator if it can be."""
 
-    def __init__(self, stage: Stage, library: Own):
+    def __init__(self, stage: Stage, weights: Weights):
         super().__init__()
-        self.downsample = fast(stage.downsample, library)
+        self.downsample = fast(stage.downsample, weights)
         blocks: list[Any] = list(stage.blocks)
         if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
             raise ValueError("both products of an MLP must be quantized, or none")
-        self.blocks = library.blocks(blocks)
-        layers = [block.mlp.fc1 for block in blocks]
-        # The widest tokens are queries, keys and values, or those within the MLP.
-        widest = max([3, *(-(-layer.out_features // layer.in_features) for layer in layers)])
-        self.most_numbers = max(CACHED_BYTES // (widest * library.dtype.itemsize), 1)
+        self.blocks = blocks_of(blocks, weights)
         biases = [block.attn.position_bias for block in blocks]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         self.heads = [bias.heads for bias in relative]
@@ -167,17 +155,4 @@ class FastStage(nn.Module):
         return [table.contiguous() for table in tables]
 
     def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-        x = self.downsample(x)
-        if isinstance(self.blocks, OwnBlocks) or x.numel() <= self.most_numbers:
-            return self.blocks(x, tables)
-        count = min(-(-x.numel() // self.most_numbers), len(x))
-        x = x.contiguous()
-        parts = zip(x.tensor_split(count), *(_split(t, count) for t in tables), strict=True)
-        for part, *of_part in parts:
-            self.blocks(part, of_part)  # in place
-        return x
-
-
-def _split(table: Tensor, count: int) -> Sequence[Tensor]:
-    """The table for each part of the images. A table for all images serves every part."""
-    return [table] * count if len(table) == 1 else table.tensor_split(count)
+        return self.blocks(self.downsample(x), tables)

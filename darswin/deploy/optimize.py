@@ -1,23 +1,19 @@
 """Fast copies of models for inference on CPUs.
 
-In float32 and int8 the whole network is one C++ operator, on every CPU. In bfloat16 oneDNN computes
-the products, and the norm that follows a residual adds it.
+The whole network is one C++ operator, on every CPU, in float32 and with 8 bits.
 """
 
 import copy
-import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NoReturn, Self, TypeVar
+from typing import Any, NoReturn, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from darswin.deploy.fast import fast
 from darswin.deploy.networks import Programs
-from darswin.deploy.packed import fastest_dtype, library_of
 from darswin.deploy.program import NoProgramError, Weights
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.adapter import adapted
@@ -31,12 +27,12 @@ from darswin.views.base import Pair
 __all__ = ["optimize"]
 
 Net = TypeVar("Net", bound=Model)
-DTYPES = (torch.float32, torch.bfloat16, torch.int8)
+DTYPES = (torch.float32, torch.int8)
 
 
 def optimize(
     model: Net,
-    dtype: torch.dtype | Literal["fastest"] = torch.float32,
+    dtype: torch.dtype = torch.float32,
     *,
     lens: Lens | None = None,
     batches: Iterable[Sequence] | None = None,
@@ -49,56 +45,43 @@ def optimize(
 
     Args:
         model: a model of `create_model`, or a `LensAdapter` of one, on the CPU.
-        dtype: torch.float32, torch.bfloat16 or torch.int8. With bfloat16, the maps between the
-            layers and the result are bfloat16; distances stay float32. With int8, the products of a
-            quantized model (see `quantize_model`) are computed with 8 bits, and the rest with
-            float32; for a picture with infinite or NaN pixels the result is finite but meaningless.
-            "fastest": int8 for a quantized model or with `batches`, otherwise float32 or
-            bfloat16, whichever is faster here.
+        dtype: torch.float32 or torch.int8. With int8, the products of a quantized model (see
+            `quantize_model`) are computed with 8 bits, and the rest with float32; for a picture
+            with infinite or NaN pixels the result is finite but meaningless.
         lens: a single lens, if all images come from one camera. The copy is then called
             `optimized(images)`. It computes the grid and the position biases once for each image
             size.
         batches: of (images, lens), typical pictures. With int8, they quantize a model that is not
             quantized yet.
-        strict: refuses a model of float32 or int8 that cannot be one program. Without it, such a
-            model runs layer by layer, which is slower, and its `repr` says why.
-
-    Warns if torch lacks oneDNN's bfloat16 products. The copy then uses torch's own, which are
-    slower.
+        strict: refuses a model that cannot be one program. Without it, such a model runs layer by
+            layer, which is slower, and its `repr` says why.
 
     Raises:
         TypeError: another kind of model; or with `strict`, one with a part that is no instruction
-            of a program, or a dtype or library that has no programs.
+            of a program.
         ValueError: an unsupported dtype or device; a `lens` that is not a single lens; batches
             without int8 or for a quantized model; int8 with neither.
         ImportError: darswin's compiled module cannot be loaded.
     """
     check_model(model, dtype, lens)
     _module.require("optimize")
-    if dtype == "fastest":
-        is_whole = batches is None and not quantized_layers(model)
-        dtype = fastest_dtype() if is_whole else torch.int8
     if dtype == torch.int8:
-        model, dtype = _quantized(model, batches), torch.float32
+        model = _quantized(model, batches)
     elif batches is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
-    if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
-        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
-    library = library_of(dtype)
     made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
-    fast(made, library)
+    weights, lack = Weights(), ""
+    fast(made, weights)
     for part in made.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype)
-    vars(made).update(fixed_lens=lens, known={}, weights=library.weights)
-    lack = "bfloat16, whose products oneDNN computes" if dtype == torch.bfloat16 else ""
-    if not lack:
-        try:
-            vars(made).update(programs=Programs(made, made.layers, library.weights))
-        except NoProgramError as error:
-            lack = str(error)
+    vars(made).update(fixed_lens=lens, known={}, weights=weights)
+    try:
+        vars(made).update(programs=Programs(made, made.layers, weights))
+    except NoProgramError as error:
+        lack = str(error)
     if lack and strict:
         raise TypeError(f"model must become one program, but it runs layer by layer: {lack}")
     vars(made).update(lack=lack and f"layer by layer, because of {lack}")
@@ -114,7 +97,7 @@ def _quantized(model: Net, batches: Iterable[Sequence] | None) -> Net:
     return model if batches is None else quantize_model(model, batches)
 
 
-def check_model(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
+def check_model(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
     """TypeError or ValueError for what `optimize` does not take."""
     if not isinstance(network := adapted(model), (Encoder, PixelModel, FeatureMaps)):
         raise TypeError(
@@ -125,9 +108,8 @@ def check_model(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -
         raise TypeError("model must be a model of create_model, got an optimized model")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
-    if dtype not in (*DTYPES, "fastest"):
-        known = ", ".join(map(str, DTYPES))
-        raise ValueError(f'dtype must be one of {known} or "fastest", got {dtype}')
+    if dtype not in DTYPES:
+        raise ValueError(f"dtype must be {' or '.join(map(str, DTYPES))}, got {dtype}")
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
         raise ValueError(

@@ -87,6 +87,12 @@ class OwnNorm:
         return _NORM(x, self.parameters, self.eps)
 
 
+def own_linear(layer: Any, norm: nn.LayerNorm | None = None, *, gelu: bool = False) -> OwnLinear:
+    """A linear layer, behind a norm or before a GELU if asked."""
+    before = None if norm is None else OwnNorm(norm)
+    return OwnLinear(packed_weights(layer), layer.out_features, gelu=gelu, norm=before)
+
+
 class PackedDeformable:
     """What deformable attention has besides the parts of a block, packed.
 

@@ -14,18 +14,14 @@ MatmulBackend = Literal["torch", "onednn"]
 MATMUL_BACKENDS = get_args(MatmulBackend)
 
 
-def onednn_lack(dtype: torch.dtype) -> str | None:
-    """The reason why oneDNN cannot compute products in `dtype` here, or None if it can."""
-    if dtype not in (torch.float32, torch.bfloat16):
-        return f"oneDNN has no products in {dtype}"
+def onednn_lack() -> str | None:
+    """The reason why oneDNN cannot compute products in float32 here, or None if it can."""
     if not torch.backends.mkldnn.is_available():
         return f"torch {torch.__version__} is built without oneDNN"
     if not torch.backends.mkldnn.enabled:
         return "torch.backends.mkldnn.enabled is False"
     if not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
         return f"torch {torch.__version__} has no linear operator of oneDNN"
-    if dtype == torch.bfloat16 and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
-        return "oneDNN has no bfloat16 products on this CPU"
     return None
 
 
@@ -63,7 +59,7 @@ def _is_concerned(x: Tensor, weight: Tensor) -> bool:
         and x.device.type == weight.device.type == "cpu"
         and x.numel() > 0
         and not torch.is_autocast_enabled("cpu")
-        and onednn_lack(torch.float32) is None
+        and onednn_lack() is None
     )
 
 

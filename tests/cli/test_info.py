@@ -47,7 +47,7 @@ def test_what_is_missing_and_why_onednn_is_not_used(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
     found = facts()
-    assert "is built without oneDNN" in found["float32"]
+    assert "is built without oneDNN" in found["oneDNN"]
     for extra, packages in declared["optional-dependencies"].items():
         assert all(package.partition(">")[0] in found[f"[{extra}]"] for package in packages)
 

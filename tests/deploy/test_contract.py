@@ -208,10 +208,9 @@ def check_optimized(model, images, lenses):
     sampled = fast.sample(images, prepared)
     assert_close(fast.run_sampled(sampled, prepared, images), expected)
     assert_close(optimize(model, lens=lenses[0])(images), model(images, lenses[0]))
-    half = optimize(model, torch.bfloat16)(images, lenses)
     empty = fast(images[:0], lenses[0])
-    for one, nothing, other in zip(*map(maps_of, (half, empty, expected)), strict=True):
-        assert relative_error(one, other) < 0.2 and nothing.shape == other[:0].shape
+    for nothing, one in zip(*map(maps_of, (empty, expected)), strict=True):
+        assert nothing.shape == one[:0].shape
 
 
 def check_saved(model, family, options, images, lenses, folder):
@@ -273,9 +272,7 @@ def test_a_network_gives_the_same_however_it_runs(case, lens, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.unsanitized
-@pytest.mark.parametrize(
-    "family", slow_but(FAMILIES, "darswin_unet_ra", marks=products)
-)
+@pytest.mark.parametrize("family", slow_but(FAMILIES, "darswin_unet_ra", marks=products))
 def test_so_do_the_large_sizes(family, tmp_path):
     check((family, dict(size="small")), *LENSES["round"], tmp_path)
 

@@ -13,11 +13,10 @@ from helpers import refused, relative_error
 from torch import nn
 
 from darswin import optimize
-from darswin.deploy import packed
 from darswin.deploy import quantize as module
 from darswin.deploy.export import export_onnx, export_package
 from darswin.deploy.quantize import quantize_model, sensitivities
-from darswin.layers.linear import Linear, onednn_lack
+from darswin.layers.linear import Linear
 from darswin.layers.quantized import (
     Quantization,
     QuantizedLinear,
@@ -162,21 +161,6 @@ def test_saved_and_loaded(tmp_path):
 
 @pytest.mark.slow
 @torch.no_grad()
-def test_fastest(monkeypatch):
-    model, seen = network(), batch()
-    quantized = quantize_model(model, [seen])
-    for dtype in (torch.float32, torch.bfloat16):
-        monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda dtype=dtype: dtype)
-        if onednn_lack(dtype) is None:
-            assert torch.equal(optimize(model, "fastest")(*seen), optimize(model, dtype)(*seen))
-    monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
-    want = optimize(quantized, torch.int8)(*seen)
-    assert torch.equal(optimize(quantized, "fastest")(*seen), want)
-    assert torch.equal(optimize(model, "fastest", batches=[seen])(*seen), want)
-
-
-@pytest.mark.slow
-@torch.no_grad()
 @pytest.mark.parametrize("name", ["darswin_a", "dat"])
 def test_the_largest_sums_do_not_overflow(name):
     """CPUs without VNNI may add the products of two bytes in 16 bits, where 2 · 255 · 127 is too
@@ -224,26 +208,6 @@ def test_blocks_with_other_attention_go_layer_by_layer():
     assert relative_error(fast(*seen), quantized(*seen)) < 0.02
 
 
-def test_the_best_of_some_turns_counts_but_not_the_first(monkeypatch):
-    times = iter([0, 0, 0, 3, 3, 7, 7, 9, 9, 16])  # seconds: 3 and 4, then 2 and 7
-    monkeypatch.setattr(packed.time, "perf_counter", lambda: next(times))
-    calls = []
-    runs = dict(a=lambda: calls.append("a"), b=lambda: calls.append("b"))
-    assert packed.best_seconds(runs, turns=3) == dict(a=2, b=4)
-    assert calls == ["a", "b"] * 3
-
-
-def test_fastest_dtype_is_measured(monkeypatch):
-    packed.fastest_dtype.cache_clear()
-    state = torch.get_rng_state()
-    assert packed.fastest_dtype() in (torch.float32, torch.bfloat16)
-    assert torch.equal(torch.get_rng_state(), state)
-    packed.fastest_dtype.cache_clear()
-    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
-    assert packed.fastest_dtype() == torch.float32
-    packed.fastest_dtype.cache_clear()
-
-
 def test_wrong_arguments():
     model, seen = network(), batch()
     quantized = quantize_model(model, [seen])
@@ -266,7 +230,7 @@ def test_wrong_arguments():
         refused(message, quantize_model, given, batches, error=kind)
     for given, dtype, batches in (
         (quantized, torch.float32, None),
-        (model, torch.bfloat16, [seen]),
+        (model, torch.float32, [seen]),
         (model, torch.int8, None),
         (quantized, torch.int8, [seen]),
     ):

@@ -186,12 +186,6 @@ def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
 # -- calls -----------------------------------------------------------------------------------------
 
 
-def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float = 1e-5) -> Tensor:
-    """The private operator: adds y to x, makes y the layer norm of the sum, and returns y."""
-    torch.ops.darswin._add_norm_(x, y, weight, bias, eps)
-    return y
-
-
 def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tuple[Tensor, ...]:
     """x, y and radius of the points, (B, N_r, N_a) each, in float64."""
     radii, azimuths, center = radii.double(), azimuths.double(), center.double()

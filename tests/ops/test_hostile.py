@@ -28,8 +28,8 @@ DTYPES = (
 
 def valid(name: str) -> list:
     """The arguments of a valid call of an operator."""
-    if name == "_add_norm_":
-        return [*(torch.rand(shape) for shape in ((3, 4), (3, 4), (4,), (4,))), 1e-5]
+    if name == "_norm":
+        return [torch.rand(3, 4), torch.rand(2, 4), 1e-5]
     if name == "_polar_to_image_plan":
         return valid("polar_to_image")[:7]
     public = name.removesuffix("_backward")
@@ -40,7 +40,7 @@ def valid(name: str) -> list:
 
 
 PUBLIC = ("polar_sample", "window_attention", "polar_to_image")
-PRIVATE = ("_add_norm_", "_polar_to_image_plan")
+PRIVATE = ("_norm", "_polar_to_image_plan")
 NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), *PRIVATE]
 
 

@@ -11,8 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from test_blocks import WINDOWS, stage
 
-from darswin.deploy.own import norm_parameters, packed_weights
-from darswin.deploy.packed import Own
+from darswin.deploy.own import norm_parameters, own_linear, packed_weights
+from darswin.deploy.packed import OwnBlocks
+from darswin.deploy.program import Weights
 from darswin.layers.quantized import (
     QuantizedLinear,
     quantize,
@@ -63,7 +64,7 @@ def test_sums_are_exact(rows, depth, columns, zero_point, weight, value, seed):
     q = tokens(rows, depth, value=value)
     sums = (q.int() - zero_point) @ linear.weight.int().t()
     assert sums.dtype == torch.int32
-    assert torch.equal(Own().linear(linear)(q), sums.float())
+    assert torch.equal(own_linear(linear)(q), sums.float())
 
 
 @pytest.mark.parametrize("bias", [True, False])
@@ -81,8 +82,8 @@ def test_products_are_exact_but_for_roundings(size, bias):
         linear.bias if bias else torch.zeros(columns),
     )
     most = 4 * torch.finfo(torch.float32).eps * (product.abs() + bias.abs())  # of four roundings
-    assert ((Own().linear(linear)(q) - (product + bias)).abs() <= most).all()
-    found = Own().linear(linear, gelu=True)(q)
+    assert ((own_linear(linear)(q) - (product + bias)).abs() <= most).all()
+    found = own_linear(linear, gelu=True)(q)
     torch.testing.assert_close(found, F.gelu(product + bias).float(), rtol=1e-5, atol=1e-5)
 
 
@@ -134,13 +135,13 @@ def step_by_step(blocks, tables, x):
 def test_blocks_are_those_of_the_layers(batch, names, sizes):
     blocks, tables = quantized_stage(names, **sizes)
     x = torch.randn(batch, *blocks[0].attn.map_size, blocks[0].attn.dim)
-    got = Own().blocks(blocks)(x.clone(), tables)
+    got = OwnBlocks(blocks, Weights())(x.clone(), tables)
     assert torch.equal(got, step_by_step(blocks, tables, x) if batch else x)
 
 
 def test_same_bits_on_any_number_of_threads():
     blocks, tables = quantized_stage(dim=48, map_size=(16, 32))
-    packed, x = Own().blocks(blocks), torch.randn(4, 16, 32, 48)
+    packed, x = OwnBlocks(blocks, Weights()), torch.randn(4, 16, 32, 48)
     weights, rows = packed_weights(layer(701, 500)), tokens(100, 701)
     assert_same_bits_on_any_number_of_threads(
         lambda: dict(
@@ -154,9 +155,9 @@ def test_same_bits_on_any_number_of_threads():
 def test_numbers_that_are_not_finite_stay_in_their_windows():
     blocks, tables = quantized_stage(depth=1)
     x = torch.randn(1, 8, 16, 24)
-    clean = Own().blocks(blocks)(x.clone(), tables)
+    clean = OwnBlocks(blocks, Weights())(x.clone(), tables)
     x[0, 0, 0, 3] = math.nan
-    got = Own().blocks(blocks)(x, tables)
+    got = OwnBlocks(blocks, Weights())(x, tables)
     assert torch.equal(got[:, 4:], clean[:, 4:]) and torch.equal(got[:, :, 8:], clean[:, :, 8:])
 
 

@@ -1,15 +1,13 @@
-// Adds a residual and normalizes the layer, in one pass over memory.
+// Normalizes tokens, in one pass over memory.
 //
 // A row holds the features of one token. It fits the first-level cache, so memory is read only once
-// although three loops go over the row. The first loop adds x and y and computes the mean. The
-// second loop subtracts the mean and sums the differences and their squares. The third loop writes
-// the normalized row.
+// although three loops go over the row. The first loop computes the mean. The second loop subtracts
+// the mean and sums the differences and their squares. The third loop writes the normalized row.
 //
 // Subtracting the mean before squaring keeps digits that a large mean would cost. The mean is
-// rounded, so the differences have a small mean of their own, which is subtracted too. If rows are
-// bfloat16, the rounded sum is normalized. The result may be 8-bit integers, which an integer
-// product can read.
-#include "../add_norm.h"
+// rounded, so the differences have a small mean of their own, which is subtracted too. The result
+// may be 8-bit integers, which an integer product can read.
+#include "../norm.h"
 
 #include "quantize.h"
 
@@ -17,14 +15,6 @@ namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-
-// Stores v and returns the stored value, which is rounded if S is bfloat16.
-template <typename S, typename V>
-inline V write(S* to, V v) {
-  store(to, v);
-  if constexpr (is_same_v<S, bfloat16>) return __builtin_bit_cast(V, rounded(v) & 0xFFFF0000);
-  return v;
-}
 
 using Half = Vector<float, kL / 2>;
 
@@ -74,23 +64,16 @@ struct Sum {
   float all() const { return total<kL>(lanes[0] + lanes[1]) + rest; }
 };
 
-template <typename S, typename Out>
-void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
+template <typename Out>
+void norm_rows(const NormArgs<Out>& a, int64_t begin, int64_t end) {
   const Quantize quantize(a.quantizer);
   const float *const weight = a.weight, *const bias = a.bias;  // which bytes in `out` do not change
   const float part = 1 / static_cast<float>(a.width);
   for (int64_t row = begin; row < end; ++row) {
-    S* x = a.x + row * a.width;
-    const S* y = a.y == nullptr ? nullptr : a.y + row * a.width;
+    const float* x = a.x + row * a.width;
     Out* out = a.out + row * a.width;
     Sum values, rest, squares;
-    if (y == nullptr) {
-      along(a.width, [&]<typename V>(int64_t c, int turn) { values.add(load<V>(x + c), turn); });
-    } else {
-      along(a.width, [&]<typename V>(int64_t c, int turn) {
-        values.add(write(x + c, load<V>(x + c) + load<V>(y + c)), turn);
-      });
-    }
+    along(a.width, [&]<typename V>(int64_t c, int turn) { values.add(load<V>(x + c), turn); });
     const float mean = values.all() * part;
     along(a.width, [&]<typename V>(int64_t c, int turn) {
       const V left = load<V>(x + c) - mean;
@@ -114,8 +97,7 @@ void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
 
 }  // namespace
 
-TIER_TABLE(AddNormKernels<float, float>) = {.rows = add_norm_rows};
-TIER_TABLE(AddNormKernels<bfloat16, bfloat16>) = {.rows = add_norm_rows};
-TIER_TABLE(AddNormKernels<float, uint8_t>) = {.rows = add_norm_rows};
+TIER_TABLE(NormKernels<float>) = {.rows = norm_rows};
+TIER_TABLE(NormKernels<uint8_t>) = {.rows = norm_rows};
 
 }  // namespace darswin
