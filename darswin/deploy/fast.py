@@ -1,5 +1,6 @@
 """The layers of optimized models, made from the layers of a model."""
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
 from typing import Any
@@ -143,7 +144,7 @@ class FastStage(nn.Module):
             self.table: Callable[[Tensor], Tensor] = partial(
                 relative[0].table, **joined_coefficients(relative)
             )
-            self.angles = blocks[0].attn.to("meta").angles  # which needs no weights
+            self.angles = copy.deepcopy(blocks[0].attn).to("meta").angles  # it needs no weights
         else:
             self.constant = [bias().contiguous() for bias in biases]
 
