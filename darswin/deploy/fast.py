@@ -67,15 +67,11 @@ def _(conv: nn.Conv2d, weights: Weights) -> nn.Module:
     return InFloat32(conv)
 
 
-@fast.register
-def _(layer: PatchProjection, weights: Weights) -> nn.Module:
-    return FastProjection(layer)
-
-
+@fast.register(PatchProjection)
 class FastProjection(nn.Module):
     """The joining of neighbours of a map, or of pixels, as a product of our own."""
 
-    def __init__(self, layer: PatchProjection):
+    def __init__(self, layer: PatchProjection, weights: Weights):
         super().__init__()
         conv, self.of_images = layer.proj, isinstance(layer, PatchEmbed)
         self.patch = conv.kernel_size[0]
@@ -102,7 +98,7 @@ def _(block: ConvBlock, weights: Weights) -> nn.Module:
 
 @fast.register(PolarPatchEmbed)
 class FastEmbed(nn.Module):
-    """The embedding of samples, in float32."""
+    """The embedding of samples."""
 
     def __init__(self, embed: PolarPatchEmbed, weights: Weights):
         super().__init__()
