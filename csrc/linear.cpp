@@ -93,6 +93,7 @@ Layer checked_layer(const Tensor& packed, int64_t depth, int64_t columns) {
 
 // Returns a norm of the parameters (2, D).
 Norm checked_norm(const Tensor& parameters, int64_t dim, double eps) {
+  check_product({2, dim});
   check_parameter(parameters, ScalarType::Float, 2 * dim);
   return {pointer<float>(parameters), dim, static_cast<float>(eps)};
 }
