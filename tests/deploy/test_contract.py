@@ -261,7 +261,8 @@ ROWS = [
     *rows(0),
     *rows(1, slow, unsanitized),
     *rows(2, slow, products, unsanitized),
-    *(pytest.param(case, "round", marks=unsanitized) for case in OPTIONS + UNUSUAL_SIZES),
+    *(pytest.param(case, "round", marks=unsanitized) for case in OPTIONS),
+    *(pytest.param(case, "round", marks=[slow, unsanitized]) for case in UNUSUAL_SIZES),
 ]
 
 
@@ -278,7 +279,9 @@ def test_so_do_the_large_sizes(family, tmp_path):
 
 
 @pytest.mark.unsanitized
-@pytest.mark.parametrize("case", OPTIONS + UNUSUAL_SIZES, ids=str)
+@pytest.mark.parametrize(
+    "case", [*OPTIONS, *(pytest.param(case, marks=slow) for case in UNUSUAL_SIZES)], ids=str
+)
 def test_with_any_options_it_trains_agrees_with_the_reference_and_has_8_bits(case):
     family, options = case
     channels, lenses = options.get("in_chans", 3), LENSES["round"][0]
@@ -312,7 +315,8 @@ IN_8_BITS = [
     ("adapter", dict(network="swin", view="mercator")),
 ]
 ROWS_OF_8_BITS = [
-    pytest.param(case, marks=() if k % 4 == 0 else unsanitized) for k, case in enumerate(IN_8_BITS)
+    pytest.param(case, marks=[slow, unsanitized] if k % 4 else [])
+    for k, case in enumerate(IN_8_BITS)
 ]
 
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import refused, slow_but
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
@@ -122,7 +122,7 @@ def check(scenes, sources, turn=STILL):
     assert error.max() < 8 * per_pixel
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", slow_but(LENSES, "kitti360", "oblong"))
 def test_a_ray_keeps_its_content(name):
     sources = scene_of(name), scene_of(name, "distance")
     for framing, crop, turn in (
@@ -209,7 +209,7 @@ def remaps(lens):
             yield CameraView(other, turn=turn).at(lens, size_of(lens))
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", slow_but(LENSES, "kitti360", "oblong"))
 def test_points_of_both_pictures_belong_together(name):
     lens = LENSES[name]
     azimuth = torch.linspace(-3, 3, 7, dtype=torch.float64)[None]
