@@ -17,7 +17,8 @@ FLOORS = (
     ("data", "layers"),
     ("calibrate", "views"),
     ("lens",),
-    ("boxes", "frames", "ops"),
+    ("frames", "ops"),
+    ("boxes",),
     ("utils",),
 )
 MOST_LINES = 400

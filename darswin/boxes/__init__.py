@@ -14,12 +14,13 @@ the corners are mostly empty, so a rectangle would grow with every step.
 """
 
 from darswin.boxes.carried import carry, carry_mask, carry_points, carry_polygon
+from darswin.boxes.instances import Instances
 from darswin.boxes.overlap import clip, iou, merge
 from darswin.boxes.rle import decode_rle, encode_rle
 from darswin.boxes.sphere import spherical
 from darswin.boxes.turned import corners, turned
 
 __all__ = [
-    "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "corners", "decode_rle",
-    "encode_rle", "iou", "merge", "spherical", "turned",
+    "Instances", "carry", "carry_mask", "carry_points", "carry_polygon", "clip", "corners",
+    "decode_rle", "encode_rle", "iou", "merge", "spherical", "turned",
 ]  # fmt: skip

@@ -43,6 +43,14 @@ def box_of(outlines: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate((points.min(0), points.max(0)))
 
 
+def box_of_mask(mask: np.ndarray) -> np.ndarray:
+    """The box (4,) of the pixels of a mask (H, W); NaN without any."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return np.full(4, np.nan)
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
+
+
 def contains(outline: np.ndarray, point: np.ndarray) -> bool:
     """Whether a point (2,) is inside an outline (P, 2)."""
     x, y = (outline - point).T

@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
@@ -15,24 +16,17 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 import torch
 
-from darswin import boxes
+from darswin.boxes import Instances, encode_rle, spherical
 from darswin.cli.answers import TOP, Answers, file_of, label_png, said, write_overlay
-from darswin.cli.found import (
-    coco_ids,
-    coco_results,
-    drawn,
-    entries,
-    in_picture,
-    rounded,
-    without_overlaps,
-    yolo_lines,
-)
 from darswin.cli.names import read_names
 from darswin.cli.views import named_view
+from darswin.data.labels.coco import coco_annotations, picture_ids
+from darswin.data.labels.yolo import yolo_lines
 from darswin.frames import Sampler
 from darswin.frames.forms import Pixels
-from darswin.frames.onnx import Detections, OnnxNetwork
+from darswin.frames.onnx import OnnxNetwork
 from darswin.lens import Lens
+from darswin.models.detections import in_picture
 from darswin.ops.checks import per_channel
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
@@ -40,7 +34,7 @@ from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
 from darswin.views import PlainView, Remap
 from darswin.views.floor import check_floor
-from darswin.viz.pixels import label_image, overlay, palette
+from darswin.viz.pixels import draw_instances, label_image, overlay, palette
 
 VIEW, THRESHOLD, RESULTS = "mercator", 0.3, "coco.json"
 
@@ -55,31 +49,31 @@ class Emptied(UserWarning):
 
 class Boxes:
     """Counts the boxes of a network that have no area, and those that are within its first pixels,
-    where no thing is."""
+    where nothing is."""
 
     smallest = 2.0  # px
 
     def __init__(self) -> None:
         self.count = self.without_area = self.in_corner = 0
 
-    def add(self, found: Sequence[Detections]) -> None:
-        for given, *_ in found:
-            has_area = (given[:, :2] < given[:, 2:]).all(1)
-            in_corner = (np.abs(given) < self.smallest).all(1)
-            self.count += len(given)
+    def add(self, detections: Sequence[Instances]) -> None:
+        for boxes in (instances.upright for instances in detections):
+            has_area = (boxes[:, :2] < boxes[:, 2:]).all(1)
+            in_corner = (np.abs(boxes) < self.smallest).all(1)
+            self.count += len(boxes)
             self.in_corner += int(in_corner.sum())
             self.without_area += int((~has_area & ~in_corner).sum())
 
     def wrong(self, network: str) -> str | None:
         """What is wrong if most boxes are none; warns if some are."""
-        wrong = self.without_area + self.in_corner
-        if not wrong:
+        count = self.without_area + self.in_corner
+        if not count:
             return None
         text = (
-            f"{wrong} of {self.count} boxes of {network} were left out: {self.without_area} "
+            f"{count} of {self.count} boxes of {network} were left out: {self.without_area} "
             f"without an area, and {self.in_corner} within the first {self.smallest:g} px"
         )
-        if 2 * wrong <= self.count:
+        if 2 * count <= self.count:
             warnings.warn(text, Emptied, stacklevel=2)
             return None
         hints = []
@@ -201,7 +195,7 @@ class NetworkAnswers(Answers):
     def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
         """Says where files go, which numbers do not need; names: those of `file_names`."""
         self._out, self._names = out or Path(), names
-        self._ids = coco_ids(names.values())
+        self._ids = picture_ids(names.values())
         return self
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
@@ -237,35 +231,36 @@ class NetworkAnswers(Answers):
         return Seen(remap, Sampler(made))
 
     def _detections(
-        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: list[Detections]
+        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, tiles: list[Instances]
     ) -> dict[str, Any]:
-        """Boxes of the view, or of all tiles, as boxes of the picture; draws them."""
+        """Writes and draws the detections of the view, or of all tiles, in the picture."""
         if self.network.overlaps:
-            found = [without_overlaps(one) for one in found]
-        self._boxes.add(found)
-        things = in_picture(seen.remap, found, self._floor)
-        there = boxes.spherical(things.get("turned", things["boxes"]), seen.remap.rays_of_image)
-        names = [self._name(label) for label in things["labels"].tolist()]
-        texts = [f"{name} {score:.2f}" for name, score in zip(names, things["scores"], strict=True)]
-        columns = {
-            "label": names,
-            "score": rounded(things["scores"], 4),
-            "box": rounded(things["boxes"], 2),
-            "visible": rounded(things["visible"], 4),
-            **{
-                f"{angle}_deg": rounded(np.degrees(getattr(there, angle)), 3)
-                for angle in ("azimuth", "elevation", "width", "height")
-            },
-            "ray": rounded(there.ray, 6),
-        }
-        name = file_of(entry, self._names)
+            tiles = [detections.merged(inside=1.0) for detections in tiles]
+        self._boxes.add(tiles)
+        if self._floor is not None:
+            tiles = [
+                detections.with_columns(floor=tile.floor(detections.upright, **self._floor))
+                for tile, detections in zip(seen.remap.tiles, tiles, strict=True)
+            ]
+        detections = in_picture(seen.remap, tiles)
+        if tiles[0].masks is not None:
+            # One by one: those of all instances could fill the memory.
+            masks = [
+                encode_rle(seen.remap.tiles[tile].back(tiles[tile].masks[row, None])[0] > 0.5)
+                for tile, row in detections.more["source"].tolist()
+            ]
+            detections = replace(detections, masks=masks)
+        names = [self._name(label) for label in detections.labels.tolist()]
+        name, size = file_of(entry, self._names), (image.shape[0], image.shape[1])
         if self._format == "coco":
-            self._results += coco_results(self._ids.get(name, name), things)
+            of = {"image_id": self._ids.get(name, name)}
+            self._results += [of | result for result in coco_annotations(detections)]
         if self._format == "yolo":
-            lines = yolo_lines((image.shape[0], image.shape[1]), things)
-            replace_file(self._out / f"labels/{name}.txt", lines)
-        picture = write_overlay(self._out, name, drawn(image, things, texts))
-        return {"overlay": picture, "detections": entries(things, columns)}
+            replace_file(self._out / f"labels/{name}.txt", yolo_lines(detections, size))
+        scores = zip(names, detections.scores, strict=True)
+        texts = [f"{name} {score:.2f}" for name, score in scores]
+        picture = write_overlay(self._out, name, draw_instances(image, detections, texts))
+        return {"overlay": picture, "detections": _entries(detections, names, seen.remap)}
 
     def flush(self) -> None:
         if self._format == "coco":
@@ -337,3 +332,36 @@ class NetworkAnswers(Answers):
             key = "score"  # of each class on its own
         best = np.argsort(-values, kind="stable")[: self._top]
         return [{"class": self._name(int(k)), key: round(float(values[k]), 6)} for k in best]
+
+
+def _entries(
+    detections: Instances, names: Sequence[str | int], remap: Remap
+) -> list[dict[str, Any]]:
+    """The detections in a picture as the entries of predictions.json."""
+    there = spherical(detections.boxes, remap.rays_of_image)
+    columns = {
+        "label": names,
+        "score": rounded(detections.scores, 4),
+        "box": rounded(detections.upright, 2),
+        "visible": rounded(detections.more["visible"], 4),
+    }
+    for angle in ("azimuth", "elevation", "width", "height"):
+        columns[f"{angle}_deg"] = rounded(np.degrees(getattr(there, angle)), 3)
+    columns["ray"] = rounded(there.ray, 6)
+    if detections.keypoints is not None:
+        columns["keypoints"] = rounded(detections.keypoints, 3)
+    if detections.boxes.shape[1] == 5:
+        columns["turned"] = rounded(detections.boxes, 4)
+    if "floor" in detections.more:
+        places = rounded(detections.more["floor"], 3)
+        columns["floor"] = [None if None in place else place for place in places]
+    if detections.masks is not None:
+        columns["mask"] = detections.masks
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def rounded(values: Any, digits: int) -> Any:
+    """Numbers in lists for JSON, which has no NaN and no infinity."""
+    if np.ndim(values):
+        return [rounded(value, digits) for value in values]
+    return round(float(values), digits) if math.isfinite(values) else None

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 import torch
 
+from darswin.boxes import Instances
 from darswin.cli.pictures import ByLens, is_below
 from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
-from darswin.data.labels import Labels, Thing, open_labels, write_coco, write_yolo
-from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_things
+from darswin.data.labels import Labels, open_labels, write_coco, write_yolo
+from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_instances
 from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.load import Calibration
@@ -54,10 +55,10 @@ def warp(
 ) -> None:  # fmt: skip
     """Writes a data set, its pictures and labels, as another lens or a view sees it.
 
-    Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. Things
-    of which less than a fifth is visible in the new picture are left out and listed in left.json.
-    The same command goes on where an earlier run was stopped. Pictures and labels that cannot be
-    read are named at the end; all others are written.
+    Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. What
+    is visible by less than a fifth in the new picture is left out and listed in left.json. The same
+    command goes on where an earlier run was stopped. Pictures and labels that cannot be read are
+    named at the end; all others are written.
 
     Args:
         source: a COCO file of instances or keypoints, or its folder; a folder in the form of YOLO
@@ -119,27 +120,16 @@ def warp(
     _write(folder, data, view, found, settings | {"yolo": source if in_yolo else None})
 
 
-class _Left(NamedTuple):
-    """A thing of which too little is visible: its share in each new picture."""
-
-    thing: Thing
-    shares: Sequence[float]
-
-    @property
-    def fits_no_tile(self) -> bool:
-        """Whether the tiles show enough of it only together."""
-        return bool(sum(self.shares) >= LEAST_VISIBLE)
-
-
 class _Warped(NamedTuple):
-    """What became of a picture: its new files and their labels, the things that left, and the lens
-    that took it, as JSON; or an error."""
+    """What became of a picture: its new files and their labels, the instances that left, and the
+    lens that took it, as JSON; or an error. Those that left have "shares" in `more`: how much of
+    them is visible in each new picture."""
 
     pictures: Sequence[tuple[str, Labels]] = ()
-    left: Sequence[_Left] = ()
+    left: Instances = Instances.joined(())
     lens: str = ""
     error: str = ""
-    wrong: Sequence[str] = ()  # things that cannot be read
+    wrong: Sequence[str] = ()  # instances that cannot be read
 
 
 class _Maps:
@@ -186,15 +176,12 @@ class _Work:
                 )
             for file, picture in zip(files, maps.pictures(image), strict=True):
                 write_image(self.folder / file, picture)
-        moved = [move_things(labels.things, tile) for tile in maps.remap.tiles]
-        left = [
-            _Left(thing, [one.visible for one in tiles])
-            for thing, *tiles in zip(labels.things, *moved, strict=True)
-            if all(one.visible < LEAST_VISIBLE for one in tiles)
-        ]
+        moved = [move_instances(labels.instances, tile) for tile in maps.remap.tiles]
+        shares = np.stack([instances.more["visible"] for instances in moved], 1)
+        left = labels.instances.with_columns(shares=shares)[(shares < LEAST_VISIBLE).all(1)]
         shown = [
-            Labels([thing for thing in things if thing.visible >= LEAST_VISIBLE], tile.view_size)
-            for things, tile in zip(moved, maps.remap.tiles, strict=True)
+            Labels(instances[instances.more["visible"] >= LEAST_VISIBLE], tile.view_size)
+            for instances, tile in zip(moved, maps.remap.tiles, strict=True)
         ]
         return _Warped([*zip(files, shown, strict=True)], left, maps.said, wrong=wrong)
 
@@ -322,28 +309,31 @@ def _write(
     names = {category["id"]: category["name"] for category in data.categories}
     left = [
         {
-            "file": name, "id": lost.thing.more.get("id"), "category": names[lost.thing.category],
-            "visible": round(float(max(lost.shares)), 3), "fits_no_tile": lost.fits_no_tile,
+            "file": name, "id": entry.get("id"), "category": names[label],
+            "visible": round(float(shares.max()), 3),
+            "fits_no_tile": bool(shares.sum() >= LEAST_VISIBLE),
         }
-        for name, one in zip(data.files, found, strict=True)
-        for lost in one.left
+        for name, one in zip(data.files, found, strict=True) if len(one.left)
+        for entry, label, shares in zip(
+            one.left.more["entry"], one.left.labels.tolist(), one.left.more["shares"], strict=True
+        )
     ]  # fmt: skip
     replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
     bad = [one.error for one in found if one.error]
     wrong = [*data.wrong, *(text for one in found for text in one.wrong)]
-    things = sum(len(labels.things) for _, labels in pictures)
-    print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {things} things")
+    count = sum(len(labels.instances) for _, labels in pictures)
+    print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)
     listed = f"{folder / LEFT} lists them"
     if len(left) > large:
         print(
-            f"{len(left) - large} things have left the picture, because less than "
+            f"{len(left) - large} instances have left the picture, because less than "
             f"{LEAST_VISIBLE:.0%} of them is visible; {listed}"
         )
     if large:
         print(
-            f"{large} things are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of them, "
-            f"only several together; {listed}"
+            f"{large} instances are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of "
+            f"them, only several together; {listed}"
         )
     report: list[str] = []
     for texts, what in (

@@ -7,27 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from darswin.boxes import Instances
+
 Outputs = Mapping[str, np.ndarray]
 Size = tuple[int, int]
 Where = dict[str, tuple[str, slice]]
-
-
-class Detections(NamedTuple):
-    """What a detector finds in a picture.
-
-    Shapes: boxes (K, 4), the corners x0, y0, x1, y1 in px, where the picture covers (0, 0) to
-    (W, H); scores (K,); labels (K,), the numbers of the classes. None if the network has none:
-    keypoints (K, P, 2 or 3), x and y in px, and a score; masks (K, h, w), the probabilities of
-    pixels, of the picture or of a whole fraction of it; turned (K, 5), boxes by their middle x and
-    y, width and height in px, and the angle of the width in rad, from x to y.
-    """
-
-    boxes: np.ndarray
-    scores: np.ndarray
-    labels: np.ndarray
-    keypoints: np.ndarray | None = None
-    masks: np.ndarray | None = None
-    turned: np.ndarray | None = None
 
 
 class Pixels(NamedTuple):
@@ -71,11 +55,11 @@ class Form:
 
 def grids(size: Size) -> dict[int, tuple[tuple[int, ...], int]]:
     """The strides of the grids that have so many cells, and 1, or a third of them, and 3."""
-    found: dict[int, tuple[tuple[int, ...], int]] = {}
+    strides_of: dict[int, tuple[tuple[int, ...], int]] = {}
     for strides in ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32)):
         count = len(cells(size, strides))
-        found = {count: (strides, 1), 3 * count: (strides, 3)} | found
-    return found
+        strides_of = {count: (strides, 1), 3 * count: (strides, 3)} | strides_of
+    return strides_of
 
 
 def cells(size: Size, strides: Sequence[int]) -> np.ndarray:
@@ -89,55 +73,56 @@ def cells(size: Size, strides: Sequence[int]) -> np.ndarray:
 
 def decode(
     form: Form, outputs: Outputs, count: int, size: Size, threshold: float
-) -> list[Detections]:
+) -> list[Instances]:
     """The detections in each of `count` pictures of (H, W) whose score is not below `threshold`.
+
+    Boxes are turned, (K, 5), if the network turns them; masks are the probabilities of pixels.
 
     Raises:
         ValueError: the outputs are of another number of pictures.
     """
-    found = {}
+    parts = {}
     for key, (name, columns) in form.where.items():
         values = outputs[name]
         if form.things_last and values.ndim == 3:
             values = values.swapaxes(1, 2)
-        found[key] = values[..., columns] if values.ndim else values
-    if "image" in found:
-        rows = {key: values.reshape(-1, values.shape[-1]) for key, values in found.items()}
+        parts[key] = values[..., columns] if values.ndim else values
+    if "image" in parts:
+        rows = {key: values.reshape(-1, values.shape[-1]) for key, values in parts.items()}
         number = rows["image"][:, 0]
-        each = [{key: values[number == k] for key, values in rows.items()} for k in range(count)]
-    elif found["boxes"].ndim == 2:
-        each = [found]
+        pictures = [{k: of[number == p] for k, of in rows.items()} for p in range(count)]
+    elif parts["boxes"].ndim == 2:
+        pictures = [parts]
     else:
-        of = range(len(found["boxes"]))
-        each = [{key: values[k] for key, values in found.items()} for k in of]
-    if len(each) != count:
-        raise ValueError(f"it gives the boxes of {len(each)} pictures for {count}")
-    return [_decoded(form, one, size, threshold) for one in each]
+        pictures = [{k: of[p] for k, of in parts.items()} for p in range(len(parts["boxes"]))]
+    if len(pictures) != count:
+        raise ValueError(f"it gives the boxes of {len(pictures)} pictures for {count}")
+    return [_decoded(form, picture, size, threshold) for picture in pictures]
 
 
 @np.errstate(invalid="ignore", over="ignore")  # the caller tells of them
-def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: float) -> Detections:
-    things, scores = len(found["boxes"]), found["scores"].astype(float)
+def _decoded(form: Form, parts: dict[str, np.ndarray], size: Size, threshold: float) -> Instances:
+    rows, scores = len(parts["boxes"]), parts["scores"].astype(float)
     scores = scores[:, None] if scores.ndim == 1 else scores
     if form.scores == "softmax":  # the last class is nothing
         scores = np.exp(scores - scores.max(-1, keepdims=True))
         scores = (scores / scores.sum(-1, keepdims=True))[:, :-1]
-    labels = found["labels"].reshape(things) if "labels" in found else scores.argmax(-1)
+    labels = parts["labels"].reshape(rows) if "labels" in parts else scores.argmax(-1)
     score = scores.max(-1)
     # SuperGradients has the class after the score.
-    if "image" in found and ((labels % 1).any() or (score > 1).any()):
+    if "image" in parts and ((labels % 1).any() or (score > 1).any()):
         labels, score = score, labels
     if form.scores == "sigmoid":
         score = 1 / (1 + np.exp(-score))
-    if "objectness" in found:
-        score = score * found["objectness"][:, 0]
+    if "objectness" in parts:
+        score = score * parts["objectness"][:, 0]
     keep = ~(score < threshold)
-    if "count" in found:
-        keep[int(found["count"].reshape(-1)[0]) :] = False
-    part = {key: v[keep] for key, v in found.items() if key not in ("count", "protos")}
-    boxes = part["boxes"].astype(float)
+    if "count" in parts:
+        keep[int(parts["count"].reshape(-1)[0]) :] = False
+    kept = {key: v[keep] for key, v in parts.items() if key not in ("count", "protos")}
+    boxes = kept["boxes"].astype(float)
     if form.code in ("yolox", "nanodet"):
-        *corner, stride = cells(size, grids(size)[things][0])[keep].T[..., None]
+        *corner, stride = cells(size, grids(size)[rows][0])[keep].T[..., None]
         corner = np.concatenate(corner, -1)
         if form.code == "yolox":
             boxes = np.concatenate((boxes[:, :2] + corner, np.exp(boxes[:, 2:])), -1) * stride
@@ -150,42 +135,39 @@ def _decoded(form: Form, found: dict[str, np.ndarray], size: Size, threshold: fl
         boxes = boxes[:, [1, 0, 3, 2]]
     if form.in_parts:
         boxes *= (*size[::-1], *size[::-1])
-    turned = None
-    if form.code in ("middle", "yolox"):
+    if "turn" in kept:
+        boxes = np.concatenate((boxes, kept["turn"]), -1)
+    elif form.code in ("middle", "yolox"):
         middle, half = boxes[:, :2], boxes[:, 2:] / 2
-        if "turn" in part:
-            turned = np.concatenate((boxes, part["turn"]), -1)
-            along, across = np.abs((np.cos(turned[:, 4:]), np.sin(turned[:, 4:])))
-            half = half * along + half[:, ::-1] * across
         boxes = np.concatenate((middle - half, middle + half), -1)
-    points = part.get("points")
+    points = kept.get("points")
     if points is not None:
         width = points.shape[2] if points.ndim == 3 else form.point
         shape = len(boxes), math.prod(points.shape[1:]) // width, width
         points = points.reshape(shape).astype(float)
-    masks = _masks(form, found, part, boxes, size)
-    return Detections(boxes, score[keep], labels[keep], points, masks, turned)
+    masks = _masks(form, parts, kept, boxes, size)
+    return Instances(boxes, score[keep], labels[keep], points, masks)
 
 
 def _masks(
-    form: Form, found: Outputs, part: Outputs, boxes: np.ndarray, size: Size
+    form: Form, parts: Outputs, kept: Outputs, boxes: np.ndarray, size: Size
 ) -> np.ndarray | None:
-    """The masks of things, as they are or of those that all things share; None without any."""
+    """The masks of instances, as they are or of those that all share; None without any."""
     masks: np.ndarray
-    if "protos" in found:
-        weights, protos = part["weights"], found["protos"]
+    if "protos" in parts:
+        weights, protos = kept["weights"], parts["protos"]
         masks = np.tensordot(weights.astype(np.float32), protos.astype(np.float32), 1)
-    elif "masks" in part:
-        masks = part["masks"]
+    elif "masks" in kept:
+        masks = kept["masks"]
         masks = masks.reshape(len(boxes), *masks.shape[-2:]).astype(np.float32)
     else:
         return None
     scale = size[0] / masks.shape[1]
     if scale % 1 or masks.shape[2] * scale != size[1]:
         return None  # each of its box alone
-    if "protos" in found or form.scores:
+    if "protos" in parts or form.scores:
         masks = 1 / (1 + np.exp(-masks))
-    if "protos" in found:  # they have meaning inside the box only
+    if "protos" in parts:  # they have meaning inside the box only
         x0, y0, x1, y1 = boxes.T[..., None, None] / scale - 0.5
         y, x = np.ogrid[: masks.shape[1], : masks.shape[2]]
         masks *= (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)

@@ -2,20 +2,22 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from darswin.frames.forms import RGB, Detections, Form, decode
+from darswin.boxes import Instances
+from darswin.frames.forms import RGB, Form, decode
 from darswin.frames.recognise import SCORES, TASKS, form_of, imgsz_of, names_of
 from darswin.utils.extras import lack
 from darswin.utils.files import check_is_file
 from darswin.utils.parameters import check, naming
 from darswin.utils.text import parse_json, read_text
 
-__all__ = ["Detections", "OnnxNetwork"]
+__all__ = ["OnnxNetwork"]
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _CHANNELS = (1, 3)
@@ -34,7 +36,7 @@ class OnnxNetwork:
     """A network in an ONNX file: `network(pictures)` is what it finds in them.
 
     A call takes one or several pictures as a `darswin.frames.Sampler` makes them: (n, C, H, W)
-    float32, already normalised, or (n, H, W, C) uint8. It returns a list of `Detections` for a
+    float32, already normalised, or (n, H, W, C) uint8. It returns a list of `Instances` for a
     detector, and otherwise a dict of the outputs: numbers (n, K), and maps (n, K, H/k, W/k) with a
     whole number k. Maps of integers, such as ids of classes, may lack K.
 
@@ -102,27 +104,27 @@ class OnnxNetwork:
         self._is_seen = False
         black = np.zeros((count, self.channels, *self.size), np.float32)
         self.batch = batch or (count if count > 1 and self._takes(black) else 1)
-        found = self(black)
+        answers = self(black)
         self._is_seen = True
         self.form = None if self._form is None else self._form.name
         self.overlaps = self._form is not None and self._form.overlaps
         self.pixels = RGB if self._form is None else self._form.pixels
         self.kind: Literal["detections", "maps", "numbers"] = "detections"
         self.shapes: dict[str, tuple[int, ...]] = {}
-        if isinstance(found, dict):
-            self.kind = "maps" if any(v.ndim == 4 for v in found.values()) else "numbers"
-            self.shapes = {name: values.shape[1:] for name, values in found.items()}
+        if isinstance(answers, dict):
+            self.kind = "maps" if any(v.ndim == 4 for v in answers.values()) else "numbers"
+            self.shapes = {name: values.shape[1:] for name, values in answers.items()}
             self._check_heads()
 
     def _read_metadata(self) -> dict[str, Any]:
         """The metadata of the file, and the configuration of transformers beside it."""
-        found = dict(self._session.get_modelmeta().custom_metadata_map)
+        metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         folder = Path(self.path).absolute().parent
         file = (folder.parent if folder.name == "onnx" else folder) / "config.json"
         if file.is_file() and "pred_boxes" in {put.name for put in self._session.get_outputs()}:
             config = parse_json(read_text(file))
-            found |= {key: config[key] for key in ("model_type", "id2label") if key in config}
-        return found
+            metadata |= {key: config[key] for key in ("model_type", "id2label") if key in config}
+        return metadata
 
     def _read_input(self) -> tuple[tuple[Any, Any], int | None]:
         """Reads the axes of the input in the graph. Returns its (H, W) and its batch, None for
@@ -132,9 +134,9 @@ class OnnxNetwork:
         first, *others = [put for put in puts if put not in sizes] or puts
         axes = [side if isinstance(side, int) and side > 0 else None for side in first.shape]
         if others or first.type not in _TYPES or len(axes) not in (3, 4):
-            given = [f"{put.name} {_text(put.shape)} of {put.type}" for put in puts]
+            named = [f"{put.name} {_text(put.shape)} of {put.type}" for put in puts]
             raise ValueError(
-                f"{self.path} has the inputs {', '.join(given)}; it must have one, pictures "
+                f"{self.path} has the inputs {', '.join(named)}; it must have one, pictures "
                 "(B, C, H, W) or (B, H, W, C) of float or uint8, and may have " + ", ".join(_SIZES)
             )
         self._more_inputs = sizes
@@ -159,7 +161,7 @@ class OnnxNetwork:
             return False
         return True
 
-    def __call__(self, pictures: np.ndarray) -> list[Detections] | dict[str, np.ndarray]:
+    def __call__(self, pictures: np.ndarray) -> list[Instances] | dict[str, np.ndarray]:
         is_uint8 = pictures.dtype == np.uint8
         if self._is_seen and is_uint8 != (self.output == "uint8"):
             wanted = "uint8" if self.output == "uint8" else "floating point, normalized"
@@ -167,18 +169,18 @@ class OnnxNetwork:
         if is_uint8:
             pictures = np.moveaxis(pictures.reshape(-1, *self.size, self.channels), -1, 1)
         pictures = pictures.reshape(-1, self.channels, *self.size)
-        found: list[Any] = []
+        answers: list[Any] = []
         for start in range(0, max(1, len(pictures)), self.batch):
             part = pictures[start : start + self.batch]
             spare = np.zeros((self.batch - len(part), *part.shape[1:]), part.dtype)
-            found += self._run(np.concatenate((part, spare)))
+            answers += self._run(np.concatenate((part, spare)))
         count = len(pictures)
-        if isinstance(found[0], Detections):
-            return found[:count]
-        return {name: np.stack([each[name] for each in found])[:count] for name in found[0]}
+        if isinstance(answers[0], Instances):
+            return answers[:count]
+        return {name: np.stack([each[name] for each in answers])[:count] for name in answers[0]}
 
     def _run(self, pictures: np.ndarray) -> list[Any]:
-        """What one batch (B, C, H, W) shows, for each picture: `Detections`, or its outputs."""
+        """What one batch (B, C, H, W) shows, for each picture: `Instances`, or its outputs."""
         if self._is_last:
             pictures = np.moveaxis(pictures, 1, -1)
         batch = np.ascontiguousarray(pictures[0] if self._is_single else pictures, self._type)
@@ -192,44 +194,46 @@ class OnnxNetwork:
             for put, value in zip(self._session.get_outputs(), values, strict=True)
         }
         try:
-            return self._found(outputs, len(pictures))
+            return self._answers(outputs, len(pictures))
         except ValueError as error:
-            given = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
-            text = f"{self.path} has the outputs {', '.join(given)}; {error}"
+            shapes = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
+            text = f"{self.path} has the outputs {', '.join(shapes)}; {error}"
             raise ValueError(text) from error
 
     def _sizes(self, count: int) -> dict[str, np.ndarray]:
         """The inputs beside the pictures, which tell their size."""
-        found = {}
+        values = {}
         for put in self._more_inputs:
             if put.name == "pixel_mask":
                 axes = zip((count, *self.size), put.shape, strict=True)
                 value = np.ones([side if isinstance(side, int) else own for own, side in axes])
             else:
                 value = np.tile(self.size[::-1], (count, 1))
-            found[put.name] = value.astype((_TYPES | _INTEGERS)[put.type])
-        return found
+            values[put.name] = value.astype((_TYPES | _INTEGERS)[put.type])
+        return values
 
-    def _found(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
+    def _answers(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
         """What the outputs (B, …) of `count` pictures show."""
         if any(value.dtype.kind not in "biuf" for value in outputs.values()):
             raise ValueError(_KNOWN)
         if self._form is None and not self._is_seen:
             self._form = self._see(outputs)
         if self._form is None:
-            if not (found := self._others(outputs, count)):
+            if not (others := self._others(outputs, count)):
                 raise ValueError(_KNOWN)
-            return found
-        found = decode(self._form, outputs, count, self.size, self.threshold)
-        for boxes, scores, labels, *_ in found:
-            self._check_numbers(boxes.clip(-1e9, 1e9), scores, labels)  # boxes may end nowhere
+            return others
+        detections = decode(self._form, outputs, count, self.size, self.threshold)
+        for instances in detections:
+            # Boxes may end nowhere.
+            labels = instances.labels
+            self._check_numbers(instances.boxes.clip(-1e9, 1e9), instances.scores, labels)
             if (labels % 1).any():
                 raise ValueError(f"it finds the class {labels[labels % 1 > 0][0]:g}; {_KNOWN}")
-        return [one._replace(labels=one.labels.astype(np.int64)) for one in found]
+        return [replace(of, labels=of.labels.astype(np.int64)) for of in detections]
 
     def _others(self, outputs: dict[str, np.ndarray], count: int) -> list[Any]:
         """Maps (K, H', W') and numbers (K,) of each picture; [] if there are other outputs."""
-        found = {}
+        answers = {}
         for name, values in outputs.items():
             if values.ndim == 4 and self._is_last:
                 values = np.moveaxis(values, -1, 1)
@@ -243,8 +247,8 @@ class OnnxNetwork:
             if not (values.ndim and is_known and len(values) == count):
                 return []
             self._check_numbers(values)
-            found[name] = values
-        return [{name: values[k] for name, values in found.items()} for k in range(count)]
+            answers[name] = values
+        return [{name: values[k] for name, values in answers.items()} for k in range(count)]
 
     def _scale_of(self, shape: Sequence[int]) -> int | None:
         """The pixels of the picture along each side of a pixel of a map, (…, H', W')."""
@@ -261,9 +265,9 @@ class OnnxNetwork:
                 scales.setdefault(shape[0], {})[name] = self._scale_of(shape)
         for of_names in scales.values():
             if len(set(of_names.values())) > 1 and 1 not in of_names.values():
-                given = ", ".join(f"{name} {_text(self.shapes[name])}" for name in of_names)
+                shapes = ", ".join(f"{name} {_text(self.shapes[name])}" for name in of_names)
                 raise ValueError(
-                    f"{self.path} has the same channels at several scales, {given}, as the heads "
+                    f"{self.path} has the same channels at several scales, {shapes}, as the heads "
                     f"of a detector, which are no maps of pixels; {_KNOWN}"
                 )
 

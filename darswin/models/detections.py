@@ -1,12 +1,13 @@
-"""Detections of networks behind views, carried back to the pixels of the images."""
+"""Detections of networks behind views, carried to the pixels of the images."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from darswin import boxes as of_boxes
+from darswin.boxes import Instances
 from darswin.models.prepared import Prepared
 from darswin.views import PixelView, Remap, View
 
@@ -32,34 +33,54 @@ def find_detections(results: Any) -> list[Mapping[str, Tensor]] | None:
     return list(results) if is_list and all(map(_has_boxes, results)) else None
 
 
-def _has_boxes(found: Any) -> bool:
+def _has_boxes(result: Any) -> bool:
     """True for a dict of boxes, scores and labels; TypeError if they are no tensors."""
-    if not (isinstance(found, Mapping) and set(NAMES) <= set(found)):
+    if not (isinstance(result, Mapping) and set(NAMES) <= set(result)):
         return False
     for name in NAMES:
-        if not isinstance(found[name], Tensor):
-            raise TypeError(f"{name} of detections must be a tensor, got {type(found[name])}")
+        if not isinstance(result[name], Tensor):
+            raise TypeError(f"{name} of detections must be a tensor, got {type(result[name])}")
     return True
 
 
+def in_picture(remap: Remap, tiles: Sequence[Instances]) -> Instances:
+    """The detections in a view, or in each of its tiles, in the picture, the best first.
+
+    Those of several tiles are merged, and what the picture does not show is left out. Boxes are cut
+    at the borders of the view first. `more` gets "visible", "rays" if the view uses the lens, and
+    "source" (K, 2): the tile and the row in it, by which masks, which are left out, can follow.
+    """
+    parts = []
+    for number, (tile, detections) in enumerate(zip(remap.tiles, tiles, strict=True)):
+        source = np.stack((np.full(len(detections), number), np.arange(len(detections))), 1)
+        part = detections.with_columns(source=source).through(
+            tile.to_image, tile.size, cut=tile.view_size,
+            rays=tile.rays if tile.view.uses_lens else None,
+        )  # fmt: skip
+        parts.append(part[part.more["visible"] > 0])
+    detections = Instances.joined(parts)
+    if len(parts) > 1:
+        return detections.merged()
+    # A network knows best which of its own boxes are one instance.
+    return detections[np.argsort(-detections.scores, kind="stable")]
+
+
 def detections_to_images(
-    found: Sequence[Mapping[str, Tensor]], view: View, prepared: Prepared
+    detections: Sequence[Mapping[str, Tensor]], view: View, prepared: Prepared
 ) -> list[dict[str, Tensor]]:
     """Carries the detections of the pictures that a view shows to the pixels of the images.
 
     Args:
-        found: for each picture, boxes (K, 4 or 5), scores (K,) and labels (K,); and optionally
+        detections: for each picture, boxes (K, 4 or 5), scores (K,) and labels (K,); and optionally
             masks (K, 1, H', W') and keypoints (K, P, 3), and other tensors (K, ...), which stay as
             they are. Values of another length are left out. The coordinates are those of
             `darswin.boxes`.
 
     Returns:
-        For each image, the same dicts. The boxes are those of what the image shows of the ellipses
-        inside them, and those of several tiles are merged, the best first. "visible" (K,) is the
-        share of the area of each ellipse that the image shows, and boxes that it does not show are
-        left out. "rays" (K, 3) are the directions of the middles of the boxes of the view, in the
-        camera's frame, unless the view ignores the lens. Masks are resampled to the
-        image, those of tiles too. Keypoints that the image does not show are NaN.
+        For each image, the same dicts, as `in_picture` says, the best first; with "visible" (K,),
+        the share of each box that the image shows, and "rays" (K, 3), the directions of the middles
+        of the boxes of the view, in the camera's frame, unless the view ignores the lens. Masks are
+        resampled to the image. Keypoints that the image does not show are NaN.
 
     Raises:
         ValueError: boxes, scores and labels do not fit together, or the view is polar.
@@ -69,56 +90,57 @@ def detections_to_images(
     if prepared.remaps is None:
         raise ValueError("detections cannot come back inside a graph: compile the network alone")
     results = []
-    for k in range(len(found) // view.count):
+    for k in range(len(detections) // view.count):
         remap = prepared.remaps[min(k, len(prepared.remaps) - 1)]
-        tiles = found[k * view.count : (k + 1) * view.count]
-        carried = [_carried(part, tile) for part, tile in zip(tiles, remap.tiles, strict=True)]
-        of_all = [name for name in carried[0] if all(name in part for part in carried)]
-        joined = {name: torch.cat([part[name] for part in carried]) for name in of_all}
-        counts = [len(part["boxes"]) for part in carried]
-        sources = torch.arange(view.count).repeat_interleave(torch.tensor(counts))
-        joined["sources"] = sources.to(joined["boxes"].device)
-        seen = joined["visible"] > 0
-        joined = {name: value[seen] for name, value in joined.items()}
-        if view.count > 1:
-            kept = of_boxes.merge(*(joined[name] for name in NAMES))
-            joined = {name: value[kept] for name, value in joined.items()}
-        sources = joined.pop("sources")
-        if "masks" in joined:
-            joined["masks"] = _masks_in_image(joined["masks"], sources, remap)
-        results.append(joined)
+        tiles = [_rows(tile) for tile in detections[k * view.count : (k + 1) * view.count]]
+        moved = in_picture(remap, [*map(_instances, tiles)])
+        names = [name for name in tiles[0] if all(name in tile for tile in tiles)]
+        starts = np.cumsum([0, *(len(tile["boxes"]) for tile in tiles)])
+        tile, row = moved.more["source"].T
+        rows = torch.from_numpy(starts[tile] + row)
+        result = {name: torch.cat([tile[name] for tile in tiles]) for name in names}
+        result = {name: column[rows.to(column.device)] for name, column in result.items()}
+        columns = {"boxes": moved.boxes, "keypoints": moved.keypoints, **moved.more}
+        for name in ("boxes", "visible", "rays", "keypoints"):
+            if columns.get(name) is not None:
+                like = result.get(name, result["boxes"])
+                dtype = like.dtype if like.is_floating_point() else torch.float32
+                result[name] = torch.from_numpy(columns[name]).to(like.device, dtype)
+        if "masks" in result:
+            result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile), remap)
+        results.append(result)
     return results
 
 
-def _masks_in_image(masks: Tensor, sources: Tensor, remap: Remap) -> Tensor:
-    """Masks (K, 1, H', W') of the tiles `sources` (K,) in the pixels of the image, (K, 1, H, W)."""
-    in_image = masks.new_zeros(*masks.shape[:-2], *remap.size)
-    for number in sources.unique().tolist():
-        mine = sources == number
-        maps = masks[mine].reshape(1, -1, *masks.shape[-2:]).cpu()
-        in_image[mine] = remap.tiles[number].back(maps).view_as(in_image[mine]).to(masks)
-    return in_image
-
-
-def _carried(found: Mapping[str, Tensor], remap: Remap) -> dict[str, Tensor]:
-    """The detections of one picture in the pixels of the image."""
-    boxes, scores = found["boxes"], found["scores"]
+def _rows(detections: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of one picture that have a row for each box; ValueError if some lack rows."""
+    boxes, scores, labels = (detections[name] for name in NAMES)
     count = len(boxes)
     are_boxes = boxes.shape in ((count, 4), (count, 5))
-    if not are_boxes or scores.shape != (count,) or found["labels"].shape != (count,):
-        shapes = ", ".join(f"{name} {tuple(found[name].shape)}" for name in NAMES)
+    if not are_boxes or scores.shape != (count,) or labels.shape != (count,):
+        shapes = ", ".join(f"{name} {tuple(detections[name].shape)}" for name in NAMES)
         raise ValueError(
             f"detections must be boxes (K, 4 or 5), scores (K,), labels (K,), got {shapes}"
         )
-    kept = {
-        name: value for name, value in found.items()
+    return {
+        name: value for name, value in detections.items()
         if isinstance(value, Tensor) and value.dim() and len(value) == count
     }  # fmt: skip
-    moved = remap.boxes_to_image(boxes)
-    kept |= dict(boxes=moved.boxes, visible=moved.visible)
-    if remap.view.uses_lens:
-        kept["rays"] = moved.rays
-    if "keypoints" in kept:
-        places = of_boxes.carry_points(kept["keypoints"][..., :2], remap.to_image)
-        kept["keypoints"] = torch.cat((places, kept["keypoints"][..., 2:]), -1)
-    return kept
+
+
+def _instances(detections: Mapping[str, Tensor]) -> Instances:
+    boxes, scores, keypoints = (
+        None if value is None else value.detach().to("cpu", torch.float64).numpy()
+        for value in map(detections.get, ("boxes", "scores", "keypoints"))
+    )
+    return Instances(boxes, scores, detections["labels"].cpu().numpy(), keypoints)
+
+
+def _masks_in_image(masks: Tensor, tiles: Tensor, remap: Remap) -> Tensor:
+    """Masks (K, 1, H', W') of `tiles` (K,) in the pixels of the image, (K, 1, H, W)."""
+    in_image = masks.new_zeros(*masks.shape[:-2], *remap.size)
+    for number in tiles.unique().tolist():
+        mine = (tiles == number).to(masks.device)
+        maps = masks[mine].reshape(1, -1, *masks.shape[-2:]).cpu()
+        in_image[mine] = remap.tiles[number].back(maps).view_as(in_image[mine]).to(masks)
+    return in_image

@@ -1,15 +1,15 @@
 """A view bound to one camera: the map between the camera's pictures and what the view shows."""
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from darswin import boxes as of_boxes
-from darswin.boxes.arrays import PointMap
+from darswin.boxes import Instances
+from darswin.boxes.arrays import PointMap, table_of
 from darswin.lens import Lens
 from darswin.ops import _module
 from darswin.ops.checks import check_pair, per_channel, tensor_there
@@ -26,19 +26,6 @@ Points = TypeVar("Points", np.ndarray, Tensor)
 
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a picture is on it
 _NUDGE = 1e-3  # px, more than the rounding of points in float32
-
-
-class MovedBoxes(NamedTuple):
-    """Boxes in another picture, as `Remap.boxes_to_image` returns them.
-
-    Attributes: boxes: (K, 4), NaN if nothing is seen; visible: (K,), the shares that are seen;
-    rays: (K, 3), the directions of the middles of the given boxes in the camera's frame, unit
-    vectors, 0 where no ray lands; None without a lens.
-    """
-
-    boxes: Any
-    visible: Any
-    rays: Any = None
 
 
 class Remap:
@@ -127,15 +114,20 @@ class Remap:
         """`rays` of pixels (..., 2) of the picture."""
         return self._moved(points, lambda p: self.some_lens.unproject_points(p, self.size))
 
-    def boxes_to_image(self, boxes: Any) -> MovedBoxes:
+    def boxes_to_image(self, boxes: Any) -> tuple[Any, Any, Any]:
         """Boxes (K, 4 or 5) of the view → boxes of the picture, by the ellipses inside them.
 
         Boxes are cut at the edges of the view first, unless they are turned, and those without an
-        area are NaN. See `darswin.boxes.carry`.
+        area are NaN. `darswin.boxes.Instances.through` moves all that belongs to them.
+
+        Returns:
+            Boxes (K, 4 or 5), NaN if nothing is shown; the shares that are shown, (K,); and the
+            directions of the middles of the boxes of the view in the camera's frame, (K, 3) unit
+            vectors, 0 where no ray lands, or None without a lens.
         """
         return self._boxes(boxes, self.to_image, (self.view_size, self.size), self.rays)
 
-    def boxes_to_view(self, boxes: Any) -> MovedBoxes:
+    def boxes_to_view(self, boxes: Any) -> tuple[Any, Any, Any]:
         """Boxes (K, 4) of the picture → boxes of the view: the inverse of `boxes_to_image`."""
         sizes = self.size, self.view_size
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
@@ -161,23 +153,17 @@ class Remap:
         return on_floor(self, boxes, height, up, radius)
 
     def _boxes(
-        self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair],
-        to_rays: PointMap,
-    ) -> MovedBoxes:  # fmt: skip
-        table = (
-            boxes.detach().to("cpu", torch.float64).numpy() if isinstance(boxes, Tensor) else boxes
-        )
-        table = np.array(table, np.float64)
-        if table.shape[-1] != 5:
-            table = of_boxes.clip(table, sizes[0])
-        table[~(of_boxes.turned(table)[:, 2:4] > 0).all(1)] = np.nan
-        found = [*of_boxes.carry(table, points_map, sizes[1])]
-        if self.lens is not None:
-            found.append(np.nan_to_num(to_rays(of_boxes.turned(table)[:, :2] - 0.5)))
+        self, boxes: Any, points_map: PointMap, sizes: tuple[Pair, Pair], rays: PointMap
+    ) -> tuple[Any, Any, Any]:
+        table = table_of(boxes.detach() if isinstance(boxes, Tensor) else boxes)
+        rays_of = None if self.lens is None else rays
+        moved = Instances(table).through(points_map, sizes[1], cut=sizes[0], rays=rays_of)
+        columns = moved.boxes, moved.more["visible"], moved.more.get("rays")
         if isinstance(boxes, Tensor):
             dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
-            found = [torch.from_numpy(values).to(boxes.device, dtype) for values in found]
-        return MovedBoxes(*found)
+            like = partial(torch.as_tensor, dtype=dtype, device=boxes.device)
+            columns = tuple(None if column is None else like(column) for column in columns)
+        return columns
 
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):

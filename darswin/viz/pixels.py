@@ -17,11 +17,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, PercentFormatter, StrMethodFormatter
 
+from darswin.boxes import Instances, corners, decode_rle
 from darswin.utils.image import with_channels
 from darswin.viz.plot import TEXT, add_legend, page_figure
 
 __all__ = [
-    "distance_image", "distance_range", "draw_boxes", "label_image", "overlay", "palette",
+    "distance_image", "distance_range", "draw_boxes", "draw_instances", "label_image", "overlay",
+    "palette",
 ]  # fmt: skip
 
 UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
@@ -198,6 +200,26 @@ def draw_boxes(
         place = left, foot - below // 2
         cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, letters, (0, 0, 0), thick)
     return drawn
+
+
+def draw_instances(image: np.ndarray, instances: Instances, texts: Sequence[str]) -> np.ndarray:
+    """Draws boxes with their texts, masks and keypoints on an image (H, W, 1 or 3) uint8: (H, W, 3)
+    uint8. Masks are run lengths, and the colours those of the labels."""
+    colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in instances.labels.tolist()]
+    picture = with_channels(image, 3)
+    if instances.masks is not None:
+        laid, where = np.zeros_like(picture), np.zeros(picture.shape[:2], bool)
+        for rle, color in reversed(list(zip(instances.masks, colors, strict=True))):
+            mask = decode_rle(rle)
+            laid[mask], where[mask] = color, True
+        picture = overlay(picture, laid, where=where)
+    outlines = corners(instances.boxes) if instances.boxes.shape[1] == 5 else None
+    picture = draw_boxes(picture, instances.upright, texts, colors, outlines)
+    keypoints = () if instances.keypoints is None else instances.keypoints
+    for points, color in zip(keypoints, colors, strict=False):
+        for x, y in points[np.isfinite(points[:, 0]), :2].astype(int).tolist():
+            cv2.circle(picture, (x, y), max(2, max(picture.shape) // 500), color, cv2.FILLED)
+    return picture
 
 
 def draw_predictions(

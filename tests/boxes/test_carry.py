@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from darswin import boxes
 from darswin.boxes.carried import cut_polygon
-from darswin.data.labels.labels import Thing, move_things
+from darswin.data.labels.labels import move_instances
 from darswin.lens import Equidistant, KannalaBrandt, Perspective
 from darswin.views import CameraView, make_view
 
@@ -98,12 +98,12 @@ def test_a_box_that_is_cut_is_that_of_what_is_left_of_its_ellipse(way):
         assert share == pytest.approx(seen.mean(), abs=2e-3) and 0.01 < share < 0.99
         assert boxes.iou(found[None], box_of(points[seen])[None])[0, 0] > 0.97
         outline = middle + half * circle[::40]
-        things = [Thing(1, box), Thing(1, box, [outline])]
-        for thing in move_things(things, to):
-            assert boxes.iou(found[None], thing.box[None])[0, 0] > 0.99
-            assert thing.visible == pytest.approx(share, abs=2e-3)
+        both = boxes.Instances(np.tile(box, (2, 1)), outlines=[[], [outline]])
+        moved = move_instances(both, to)
+        assert boxes.iou(found[None], moved.boxes).min() > 0.99
+        assert moved.more["visible"] == pytest.approx([share] * 2, abs=2e-3)
         mask = np.zeros(to.view_size, np.uint8)
-        outlines = [np.rint((one - 0.5) * 16).astype(np.int32) for one in thing.polygons]
+        outlines = [np.rint((one - 0.5) * 16).astype(np.int32) for one in moved.outlines[1]]
         cv2.fillPoly(mask, outlines, 1, shift=4)
         y, x = np.mgrid[: to.view_size[0], : to.view_size[1]].astype(float)
         there = torch.from_numpy(np.stack((x, y), -1))[None]

@@ -15,11 +15,11 @@ pytest.importorskip("onnxruntime")
 
 from graphs import write_constants, write_detector, write_graph
 
-from darswin.boxes import decode_rle, encode_rle
-from darswin.cli.found import rounded, yolo_lines
+from darswin.boxes import Instances, decode_rle, encode_rle
 from darswin.cli.main import main
 from darswin.cli.names import read_names
-from darswin.cli.network import NetworkAnswers
+from darswin.cli.network import NetworkAnswers, rounded
+from darswin.data.labels.yolo import yolo_lines
 from darswin.frames.onnx import OnnxNetwork
 from darswin.lens import Equidistant
 from darswin.utils.video import write_frames
@@ -441,9 +441,9 @@ def test_a_mask_of_few_pixels_is_a_box_in_yolo_and_infinity_is_null_in_json():
     """Two points would read as a box."""
     mask = np.zeros((10, 20), bool)
     mask[4, 6:8] = True
-    found = dict(boxes=np.array([[5.0, 4, 9, 6]]), scores=[0.5], labels=[3])
-    found["masks"] = [encode_rle(mask)]
-    assert yolo_lines((10, 20), found) == "3 0.35 0.5 0.2 0.2 0.5\n"
+    columns = dict(boxes=np.array([[5.0, 4, 9, 6]]), scores=[0.5], labels=np.array([3]))
+    lines = yolo_lines(Instances(**columns, masks=[encode_rle(mask)]), (10, 20))
+    assert lines == "3 0.350000 0.500000 0.200000 0.200000 0.500000\n"
     assert rounded([[1.26, np.inf], [np.nan, 2]], 1) == [[1.3, None], [None, 2.0]]
 
 

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -98,25 +97,25 @@ def edited(flat, edit=lambda content: None):
 
 
 def check_shown(file, box_overlap, mask_overlap):
-    """Every label lies on its thing in the new picture. Returns how many things there are."""
+    """Every label lies on its thing in the new picture. Returns how many there are."""
     data, count = read_coco(file), 0
     for k, name in enumerate(data.files):
         picture = cv2.imread(str(data.folder / name))[..., ::-1]
-        for thing in data.labels(k).things:
-            shown = picture[..., thing.category - 1] > 127
-            if thing.visible < 0.98 or shown.sum() < 100:
+        for instance in data.labels(k).instances:
+            shown = picture[..., instance.labels[0] - 1] > 127
+            if instance.more["visible"][0] < 0.98 or shown.sum() < 100:
                 continue
             count += 1
             y, x = np.nonzero(shown)
             box = [[x.min(), y.min(), x.max() + 1, y.max() + 1]]
-            assert iou(thing.box[None], box)[0, 0] > box_overlap, (name, thing)
-            if thing.rle is not None:
-                mask = decode_rle(thing.rle)
-            elif len(thing.polygons):
-                mask = drawn(thing.polygons, picture.shape[:2]) > 127
+            assert iou(instance.boxes, box)[0, 0] > box_overlap, (name, instance)
+            if instance.masks[0] is not None:
+                mask = decode_rle(instance.masks[0])
+            elif len(instance.outlines[0]):
+                mask = drawn(instance.outlines[0], picture.shape[:2]) > 127
             else:
                 continue
-            assert (mask & shown).sum() / (mask | shown).sum() > mask_overlap, (name, thing)
+            assert (mask & shown).sum() / (mask | shown).sum() > mask_overlap, (name, instance)
     return count
 
 
@@ -236,7 +235,7 @@ def test_things_that_leave_are_reported(flat, capsys):
     assert set(left[0]) == {"file", "id", "category", "visible", "fits_no_tile"}
     assert max(one["visible"] for one in left) < 0.2 and not left[0]["fits_no_tile"]
     said = capsys.readouterr().out
-    assert f"{len(left)} things have left the picture, because less than 20% of them" in said
+    assert f"{len(left)} instances have left the picture, because less than 20% of them" in said
 
 
 def test_a_second_run_goes_on(flat, capsys):
@@ -321,21 +320,22 @@ def test_what_cannot_be_read_is_named_at_the_end(flat, capsys):
     ):  # fmt: skip
         assert words in said
     data = read_coco("out/annotations.json")
-    assert [thing.more["id"] for thing in data.labels(0).things] == [3] and len(data) == 1
+    entries = data.labels(0).instances.more["entry"]
+    assert [entry["id"] for entry in entries] == [3] and len(data) == 1
 
 
 @pytest.mark.parametrize(("shares", "said"), [((0.1, 0.15), "are too large for"),
                                               ((0.1, 0), "have left")])  # fmt: skip
 def test_what_no_tile_shows_is_named_as_what_it_is(flat, capsys, monkeypatch, shares, said):
-    def lost(things, move):
+    def lost(instances, move):
         visible = (*shares, 0.0, 0.0)[len(calls) % 4]
         calls.append(move)
-        return [replace(thing, visible=visible) for thing in things]
+        return instances.with_columns(visible=np.full(len(instances), visible))
 
     calls = []
-    monkeypatch.setattr(module, "move_things", lost)
+    monkeypatch.setattr(module, "move_instances", lost)
     warp(flat, "tiles:4", "--size 32,32")
-    assert f"9 things {said} the" in capsys.readouterr().out
+    assert f"9 instances {said} the" in capsys.readouterr().out
 
 
 LAYOUTS = {
@@ -409,7 +409,7 @@ def test_grey_pictures_without_things(to, count, capsys):
     grey = cv2.imread("images/0.png", cv2.IMREAD_GRAYSCALE)
     cv2.imwrite("images/0.png", grey)
     file = warp(source, to)
-    assert f"{count} pictures of 1, with 0 things" in capsys.readouterr().out
+    assert f"{count} pictures of 1, with 0 instances" in capsys.readouterr().out
     assert json.loads(file.read_text())["annotations"] == []
     for new in Path("out/images").iterdir():
         assert cv2.imread(str(new), cv2.IMREAD_UNCHANGED).ndim == 2

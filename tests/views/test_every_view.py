@@ -19,7 +19,7 @@ from torch.utils._pytree import tree_leaves
 
 from darswin import boxes as of_boxes
 from darswin import create_model
-from darswin.data.labels.labels import Thing, move_things
+from darswin.data.labels.labels import move_instances
 from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Perspective, Spherical
 from darswin.models import LensAdapter, Swin
 from darswin.views import (
@@ -285,11 +285,13 @@ def a_box_has_one_answer(name, lens):
     angle = np.linspace(0, 2 * math.pi, 20_000, endpoint=False)
     circle = np.stack((np.cos(angle), np.sin(angle)), -1)
     for tile in remap.tiles:
-        moved = tile.boxes_to_image(table)
-        again = tile.boxes_to_image(torch.from_numpy(table).float())
-        np.testing.assert_allclose(again.boxes, moved.boxes, rtol=0, atol=1e-4)
-        assert moved.visible[3] == 0 and np.isnan(moved.boxes[3]).all()
-        for box, there, share in zip(of_boxes.clip(table, tile.view_size), *moved[:2], strict=True):
+        boxes, visible, rays = tile.boxes_to_image(table)
+        again, *_ = tile.boxes_to_image(torch.from_numpy(table).float())
+        np.testing.assert_allclose(again, boxes, rtol=0, atol=1e-4)
+        assert visible[3] == 0 and np.isnan(boxes[3]).all()
+        for box, there, share in zip(
+            of_boxes.clip(table, tile.view_size), boxes, visible, strict=True
+        ):
             middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2
             points = tile.to_image(middle + half * circle - 0.5) + 0.5
             if np.isfinite(points).all() and share == 1:
@@ -300,17 +302,16 @@ def a_box_has_one_answer(name, lens):
     found = dict(boxes=torch.from_numpy(table).float(), scores=torch.ones(4), labels=torch.ones(4))
     adapter = LensAdapter(nn.Identity(), view=view, boxes=lambda _: found)
     (by_adapter,) = adapter(torch.zeros(1, 3, *SIZE), lens)
-    seen = moved.visible > 0
-    np.testing.assert_allclose(by_adapter["boxes"], moved.boxes[seen], atol=0.02)
-    np.testing.assert_allclose(by_adapter["visible"], moved.visible[seen], atol=1e-3)
+    np.testing.assert_allclose(by_adapter["boxes"], boxes[visible > 0], atol=0.02)
+    np.testing.assert_allclose(by_adapter["visible"], visible[visible > 0], atol=1e-3)
     if view.uses_lens:
-        rays = remap.rays((table[:3, :2] + table[:3, 2:] - 1) / 2)
-        np.testing.assert_allclose(moved.rays[0], np.nan_to_num(rays[0]), atol=1e-6)
+        expected = remap.rays((table[:3, :2] + table[:3, 2:] - 1) / 2)
+        np.testing.assert_allclose(rays[0], np.nan_to_num(expected[0]), atol=1e-6)
     inner = np.array([[50.0, 40, 66, 52]])
     there, visible, _ = remap.boxes_to_view(inner)
-    (thing,) = move_things([Thing(1, inner[0])], remap)
-    np.testing.assert_allclose(thing.box, there[0], atol=0.02)
-    assert thing.visible == pytest.approx(visible[0], abs=1e-3)
+    moved = move_instances(of_boxes.Instances(inner), remap)
+    np.testing.assert_allclose(moved.boxes, there, atol=0.02)
+    assert moved.more["visible"] == pytest.approx(visible, abs=1e-3)
 
 
 @pytest.mark.parametrize(("holds", "name", "kind"), in_turn(PROPERTIES, LENSES))

@@ -1,9 +1,9 @@
-"""Labels of things: boxes, outlines, masks and keypoints, and the files of data sets."""
+"""Labels: boxes, outlines, masks and keypoints, and the files of data sets."""
 
 from pathlib import Path
 
 from darswin.data.labels.coco import coco_files, read_coco, write_coco
-from darswin.data.labels.labels import LabelledPictures, Labels, Thing, moved
+from darswin.data.labels.labels import LabelledPictures, Labels, moved
 from darswin.data.labels.woodscape import BOXES, has_boxes, read_woodscape_boxes
 from darswin.data.labels.yolo import is_yolo, read_yolo, write_yolo
 from darswin.utils.parameters import naming
@@ -12,7 +12,6 @@ from darswin.utils.text import is_json_file
 __all__ = [
     "LabelledPictures",
     "Labels",
-    "Thing",
     "moved",
     "open_labels",
     "write_coco",
@@ -21,7 +20,7 @@ __all__ = [
 
 
 def open_labels(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
-    """The pictures of a data set and their things.
+    """The pictures of a data set and their labels.
 
     Args:
         path: a COCO file or a folder with one, in it or in `annotations/`; a folder in the form of

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import compress
 from pathlib import Path
@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from darswin.boxes import decode_rle
-from darswin.boxes.regions import NO_AREA, area_of, box_of
+from darswin.boxes import Instances, corners, decode_rle
+from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing, box_of_mask
+from darswin.data.labels.labels import LabelledPictures, Labels, Size, known_keypoints, labelled
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
@@ -31,11 +31,13 @@ from darswin.utils.text import read_json
 _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",
         "visible"}  # fmt: skip
 _DIGITS = 3  # after the point, in pixels
+_SHARE_DIGITS = 4  # of scores, visible shares and degrees
+_SAME = 0.1  # px, of corners that are rounded
 _FAR = 100  # times the longer side of a picture: no thing reaches that far
 
 
 def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
-    """The pictures and things of a COCO file of instances or keypoints.
+    """The pictures and instances of a COCO file of instances or keypoints.
 
     Args:
         pictures: the folder to which `file_name` is relative, if it is in none of the usual places.
@@ -123,7 +125,7 @@ def write_coco(
     """Writes a COCO file.
 
     Box and area are those of the labels, and "visible" is the share that a picture shows. Ids that
-    several pictures or things have, or none, are numbered anew.
+    several pictures or instances have, or none, are numbered anew.
 
     Args:
         pictures: of each picture, its entry, such as {"file_name": "a.png"}, and its labels.
@@ -133,10 +135,11 @@ def write_coco(
         {**entry, "height": labels.size[0], "width": labels.size[1]} for entry, labels in pictures
     ]
     _number(entries)
-    annotations = []
-    for entry, (_, labels) in zip(entries, pictures, strict=True):
-        for thing in labels.things:
-            annotations.append(_annotation(thing) | {"image_id": entry["id"]})
+    annotations = [
+        annotation | {"image_id": entry["id"]}
+        for entry, (_, labels) in zip(entries, pictures, strict=True)
+        for annotation in coco_annotations(labels.instances)
+    ]
     _number(annotations)
     content = {"images": entries, "annotations": annotations, "categories": list(categories)}
     replace_file(path, json.dumps(content, allow_nan=False))
@@ -149,27 +152,50 @@ def _number(entries: Sequence[dict]) -> None:
             entry["id"] = number
 
 
-def _annotation(thing: Thing) -> dict[str, Any]:
-    x0, y0, x1, y1 = thing.box
-    found: dict[str, Any] = {
-        **thing.more,
-        "category_id": thing.category,
-        "bbox": _rounded((x0, y0, x1 - x0, y1 - y0)),
-        "area": round(thing.area, _DIGITS),
-        "iscrowd": int(thing.crowd),
-        "visible": round(thing.visible, _DIGITS),
-    }
-    if thing.turn:
-        turned = {"rotation": math.degrees(thing.turn)}
-        found["attributes"] = {**(thing.more.get("attributes") or {}), **turned}
-    if thing.rle is not None:
-        found["segmentation"] = thing.rle
-    elif len(thing.polygons):
-        found["segmentation"] = [_rounded(polygon.ravel()) for polygon in thing.polygons]
-    if thing.keypoints is not None:
-        found["keypoints"] = _rounded(thing.keypoints.ravel())
-        found["num_keypoints"] = int((thing.keypoints[:, 2] > 0).sum())
-    return found
+def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
+    """The instances of one picture as COCO's annotations or results, without ids of their own.
+
+    A turned box is written as its outline, the upright box around it, and in degrees as CVAT's
+    `rotation`. Keypoints that are not known or not shown are 0, 0, 0.
+    """
+    more, areas = instances.more, instances.areas.tolist()
+    annotations = []
+    for k, (x0, y0, x1, y1) in enumerate(instances.upright):
+        annotation: dict[str, Any] = dict(more["entry"][k]) if "entry" in more else {}
+        annotation["category_id"] = instances.labels[k : k + 1].tolist()[0]
+        annotation["bbox"] = _rounded((x0, y0, x1 - x0, y1 - y0))
+        annotation["area"] = round(areas[k], _DIGITS)
+        if "crowd" in more:
+            annotation["iscrowd"] = int(more["crowd"][k])
+        if "visible" in more:
+            annotation["visible"] = round(float(more["visible"][k]), _SHARE_DIGITS)
+        if instances.scores is not None:
+            annotation["score"] = round(float(instances.scores[k]), _SHARE_DIGITS)
+        if instances.masks is not None and instances.masks[k] is not None:
+            annotation["segmentation"] = instances.masks[k]
+        elif instances.outlines is not None and len(instances.outlines[k]):
+            outline = instances.outlines[k]
+            annotation["segmentation"] = [_rounded(polygon.ravel()) for polygon in outline]
+        if instances.boxes.shape[1] == 5 and (angle := instances.boxes[k, 4]):
+            turn = {"rotation": round(math.degrees(angle) % 360, _SHARE_DIGITS)}
+            annotation["attributes"] = {**(annotation.get("attributes") or {}), **turn}
+            outline = corners(instances.boxes[k, None])
+            annotation.setdefault("segmentation", [_rounded(outline.ravel())])
+        if instances.keypoints is not None:
+            points = known_keypoints(instances.keypoints[k])
+            if len(points):
+                annotation["keypoints"] = _rounded(points.ravel())
+                annotation["num_keypoints"] = int((points[:, 2] > 0).sum())
+        annotations.append(annotation)
+    return annotations
+
+
+def picture_ids(names: Iterable[str]) -> dict[str, int]:
+    """The ids of pictures in COCO by their names: like other tools, the numbers that their files
+    have as names, if no two are the same. All others are known by their names."""
+    stems = {name: name.rpartition("/")[2] for name in names}
+    ids = {name: int(stem) for name, stem in stems.items() if stem.isdecimal()}
+    return ids if len({*ids.values()}) == len(ids) else {}
 
 
 def _rounded(values: Any) -> list[float]:
@@ -198,21 +224,21 @@ def _labels(
             f"{path} says that {entry['file_name']} has {said[1]} × {said[0]} px, but it has "
             f"{size[1]} × {size[0]}{turned if said == size[::-1] else ''}"
         )
-    things, wrong = [], []
+    instances, wrong = [], []
     for annotation in annotations:
         try:
-            things.append(_thing(annotation, mirrors, size))
+            instances.append(_instance(annotation, mirrors, size))
         except ValueError as error:
             wrong.append(f"{path}: the annotation {annotation.get('id')} {error}")
-    return Labels(things, size), wrong
+    return Labels(Instances.joined(instances), size), wrong
 
 
-def _side(given: Any) -> Any:
+def _side(side: Any) -> Any:
     """A side in px, which some tools write as text; what is none stays as it is."""
     try:
-        return int(number) if (number := float(given)).is_integer() else given
+        return int(number) if (number := float(side)).is_integer() else side
     except (TypeError, ValueError, OverflowError):
-        return given
+        return side
 
 
 def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
@@ -227,7 +253,7 @@ def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
     return table
 
 
-def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing:
+def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Instances:
     segments = annotation.get("segmentation") or ()
     polygons, rle, mask = [], None, np.zeros(size, bool)
     if isinstance(segments, Mapping):
@@ -243,8 +269,8 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
         rle = rle if mask.any() else None
     else:
         parts = segments if isinstance(segments, Sequence) else [segments]
-        polygons = [_numbers("polygon", one, 2, 0) for one in parts]
-        polygons = [one for one in polygons if area_of(one) > NO_AREA]
+        polygons = [_numbers("polygon", part, 2, 0) for part in parts]
+        polygons = [polygon for polygon in polygons if area_of(polygon) > NO_AREA]
     x, y, width, height = _numbers("box", annotation.get("bbox", [0] * 4), 4)[0]
     box = np.array([x, y, x + width, y + height])
     if not (width > 0 and height > 0):  # what is there in its place
@@ -265,21 +291,36 @@ def _thing(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Thing
     is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
     if is_crowd is None:
         raise ValueError(f"has iscrowd {annotation['iscrowd']!r}, which must be 0 or 1")
-    more = {name: value for name, value in annotation.items() if name not in _OWN}
-    turn = 0.0
-    if rle is None and not polygons and isinstance(attributes := more.get("attributes"), Mapping):
-        turn = _numbers("rotation", attributes.get("rotation") or 0, 1)[0, 0]
-        if turn:  # of CVAT, in degrees
-            more["attributes"] = {k: v for k, v in attributes.items() if k != "rotation"}
+    entry = {name: value for name, value in annotation.items() if name not in _OWN}
+    if rle is None and isinstance(attributes := entry.get("attributes"), Mapping):
+        degrees = _numbers("rotation", attributes.get("rotation") or 0, 1)[0, 0]
+        turned = _turned(box, polygons, math.radians(degrees)) if degrees else None
+        if turned is not None:
+            box, polygons = turned, []
+            entry["attributes"] = {k: v for k, v in attributes.items() if k != "rotation"}
     keypoints = annotation.get("keypoints")
     visible = annotation.get("visible", 1.0)
     if not (isinstance(visible, int | float) and 0 <= visible <= 1):
         raise ValueError(f"has visible {visible!r}, which must be a share from 0 to 1")
-    return Thing(
-        annotation["category_id"], box, polygons, rle,
-        None if keypoints is None else _numbers("keypoints", keypoints, 3, 0),
-        mirrors[annotation["category_id"]], is_crowd, visible, math.radians(turn), more,
+    label = annotation["category_id"]
+    return labelled(
+        label, box, outline=polygons, mask=rle, crowd=is_crowd, visible=visible,
+        keypoints=None if keypoints is None else _numbers("keypoints", keypoints, 3, 0),
+        mirror=mirrors[label], entry=entry,
     )  # fmt: skip
+
+
+def _turned(box: np.ndarray, polygons: Sequence[np.ndarray], angle: float) -> np.ndarray | None:
+    """The turned box (5,) of CVAT's rotation, whose `bbox` is the box before it is turned; or that
+    of `coco_annotations`, whose outline are its corners. None for another outline."""
+    if not polygons:
+        return np.array([*(box[:2] + box[2:]) / 2, *(box[2:] - box[:2]), angle])
+    outline = polygons[0]
+    sides = np.linalg.norm(outline[[1, 3]] - outline[0], axis=1) if len(outline) == 4 else (0, 0)
+    turned = np.array([*outline.mean(0), *sides, angle])
+    is_box = len(polygons) == 1 and len(outline) == 4
+    is_box = is_box and np.abs(corners(turned[None])[0] - outline).max() < _SAME
+    return turned if is_box else None
 
 
 def _mirror(names: Sequence[str]) -> list[int]:

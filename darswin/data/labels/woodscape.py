@@ -1,5 +1,5 @@
 """WoodScape's boxes: `box_2d_annotations/NNNNN_VIEW.txt`, with lines "name,index,left,top,right,
-bottom", whose last four are the outermost pixels of a thing.
+bottom", whose last four are the outermost pixels of an instance.
 
 Source: github.com/valeoai/WoodScape, scripts/box_2d_generator.py.
 """
@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from darswin.boxes import Instances
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing
+from darswin.data.labels.labels import LabelledPictures, Labels, Size, labelled
 from darswin.data.scenes.files import pictures_in, stems
 from darswin.data.scenes.woodscape import calibration_files, unnested
 from darswin.utils.text import read_text
@@ -50,7 +51,7 @@ def read_woodscape_boxes(root: str | Path) -> LabelledPictures:
 
 
 def _rows(file: str, names: dict[int, str]) -> tuple[list[list[float]], list[str]]:
-    """The index and the outermost pixels of each thing; and what is wrong with other lines."""
+    """The index and the outermost pixels of each instance; and what is wrong with other lines."""
     rows, wrong = [], []
     for number, line in enumerate(read_text(file).splitlines(), 1):
         if not line.strip():
@@ -76,4 +77,5 @@ def _labels(
 ) -> tuple[Labels, list[str]]:
     rows, wrong = raw
     outermost = np.array([0, 0, 1, 1])
-    return Labels([Thing(int(index), np.add(box, outermost)) for index, *box in rows], size), wrong
+    instances = [labelled(int(index), np.add(box, outermost)) for index, *box in rows]
+    return Labels(Instances.joined(instances), size), wrong

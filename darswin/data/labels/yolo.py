@@ -1,7 +1,7 @@
-"""YOLO's text files: a line for each thing, with its class and its box, outline or keypoints.
+"""YOLO's text files: a line for each instance, with its class and its box, outline or keypoints.
 
 The labels of `…/images/…/NAME.jpg` are in `…/labels/…/NAME.txt`, or else beside the picture; a
-picture without a file has no things. `data.yaml` has the names of the classes, and `kpt_shape` if
+picture without a file has none. `data.yaml` has the names of the classes, and `kpt_shape` if
 there are keypoints; or `classes.txt` has one name per line. All numbers are shares of the sides of
 the picture. The four corners of an oriented box are an outline, and become one of many corners.
 
@@ -10,22 +10,25 @@ Source: docs.ultralytics.com/datasets.
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
+from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, Thing
+from darswin.data.labels.labels import LabelledPictures, Labels, Size, known_keypoints, labelled
 from darswin.data.scenes.files import calibration_in, pictures_in
 from darswin.utils.files import replace_file
 from darswin.utils.text import read_text
 
 _SPLITS = ("train", "val", "test")
-_FAR = 100  # a share of a side that no thing reaches
+_FAR = 100  # a share of a side that no instance reaches
 _NAMES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt")
 
 
@@ -37,7 +40,7 @@ def is_yolo(path: Path) -> bool:
 
 
 def read_yolo(path: str | Path) -> LabelledPictures:
-    """The pictures below a folder, of all splits, and their things.
+    """The pictures below a folder, of all splits, and their instances.
 
     Raises:
         FileNotFoundError: no classes, no pictures, or no labels.
@@ -66,8 +69,8 @@ def write_yolo(
 ) -> None:
     """Writes the text files and `data.yaml` for pictures in `root`; arguments as for `write_coco`.
 
-    The classes are the categories in their order. A thing with masks or without an outline is
-    written as a box, and parts of an outline are joined. Crowds are left out, as YOLO has none.
+    The classes are the categories in their order. Crowds are left out, as YOLO has none; see
+    `yolo_lines` for the others.
 
     Args:
         more: other entries of `data.yaml`, such as the splits.
@@ -75,34 +78,59 @@ def write_yolo(
     number = {category["id"]: k for k, category in enumerate(categories)}
     shape = None
     for entry, labels in pictures:
-        lines = []
-        for thing in labels.things:
-            if not thing.crowd:
-                numbers = _numbers(thing, np.array(labels.size[::-1]))
-                lines.append(
-                    " ".join([str(number[thing.category]), *map("{:.6f}".format, numbers)])
-                )
-            if thing.keypoints is not None:
-                shape = list(thing.keypoints.shape)
+        instances = labels.instances
+        if "crowd" in instances.more:
+            instances = instances[~instances.more["crowd"]]
+        if instances.keypoints is not None and len(instances):
+            shape = list(instances.keypoints.shape[1:])
+        classes = [number[label] for label in instances.labels.tolist()]
+        lines = yolo_lines(replace(instances, labels=np.array(classes)), labels.size)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))
-        replace_file(text, "".join(f"{line}\n" for line in lines))
+        replace_file(text, lines)
     names = {k: category["name"] for k, category in enumerate(categories)}
     content = {"path": ".", **(more or {}), "names": names}
     content |= {} if shape is None else {"kpt_shape": shape}
     replace_file(Path(root) / _NAMES[0], yaml.safe_dump(content, sort_keys=False))
 
 
-def _numbers(thing: Thing, sides: np.ndarray) -> np.ndarray:
-    if len(thing.polygons) and thing.keypoints is None:
-        # Parts are joined by lines there and back between their first points.
-        closed = [np.concatenate((part, part[:1])) for part in thing.polygons]
-        back = [part[:1] for part in thing.polygons[-2::-1]]
-        return (np.concatenate(closed + back)[:-1] / sides).ravel()
-    low, high = thing.box[:2] / sides, thing.box[2:] / sides
-    found = [(low + high) / 2, high - low]
-    if thing.keypoints is not None:
-        found.append((thing.keypoints / [*sides, 1.0]).ravel())
-    return np.concatenate(found)
+def yolo_lines(instances: Instances, size: Size) -> str:
+    """The lines of one picture of (H, W): class, place, and score if there are scores.
+
+    The place is the outline, whose parts are joined, or that of the mask; the corners of a turned
+    box; or else the box. Instances with keypoints are written as boxes, as YOLO has no both.
+    """
+    sides, upright = np.array(size[::-1], float), instances.upright.reshape(-1, 2, 2)
+    lines = []
+    for k, (low, high) in enumerate(upright):
+        numbers = np.stack(((low + high) / 2, high - low)) / sides
+        points = None if instances.keypoints is None else known_keypoints(instances.keypoints[k])
+        if points is not None and len(points):
+            numbers = np.concatenate((numbers.ravel(), (points / [*sides, 1.0]).ravel()))
+        elif outline := _outline(instances, k):
+            numbers = _one_part(outline) / sides
+        elif instances.boxes.shape[1] == 5 and instances.boxes[k, 4]:
+            numbers = corners(instances.boxes[k, None])[0] / sides
+        score = [] if instances.scores is None else [instances.scores[k]]
+        text = " ".join(f"{number:.6f}" for number in (*numbers.ravel(), *score))
+        lines.append(f"{int(instances.labels[k])} {text}\n")
+    return "".join(lines)
+
+
+def _outline(instances: Instances, row: int) -> Sequence[np.ndarray]:
+    """The parts of the outline of an instance, or of its mask; none if it has neither."""
+    if instances.masks is None or instances.masks[row] is None:
+        return () if instances.outlines is None else instances.outlines[row]
+    mask = decode_rle(instances.masks[row]).astype(np.uint8)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = [outline.reshape(-1, 2) + 0.5 for outline in outlines]
+    return [outline for outline in outlines if area_of(outline) > NO_AREA]
+
+
+def _one_part(polygons: Sequence[np.ndarray]) -> np.ndarray:
+    """The parts of an outline, joined by lines there and back between their first points."""
+    closed = [np.concatenate((part, part[:1])) for part in polygons]
+    back = [part[:1] for part in polygons[-2::-1]]
+    return np.concatenate(closed + back)[:-1]
 
 
 def _text_of(root: Path, stem: Path) -> Path:
@@ -119,10 +147,10 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
     """The folder of the pictures, and what the file of classes says; its names as a list."""
     file = path
     if path.suffix.lower() not in (".yaml", ".yml"):
-        found = [path / name for name in _NAMES if (path / name).is_file()]
-        if not found:
+        files = [path / name for name in _NAMES if (path / name).is_file()]
+        if not files:
             raise FileNotFoundError(f"no data.yaml or classes.txt in {path}")
-        file = found[0]
+        file = files[0]
     if file.suffix == ".txt":
         names = [line.strip() for line in read_text(file).splitlines() if line.strip()]
         return file.parent, {"names": names}
@@ -159,14 +187,14 @@ def moved_splits(
     for split in _SPLITS:
         if not content.get(split):
             continue
-        given = content[split] if isinstance(content[split], list) else [content[split]]
-        found = [_below(root, str(one)) for one in given]
-        if lost := [one for one, there in zip(given, found, strict=True) if there is None]:
+        listed = content[split] if isinstance(content[split], list) else [content[split]]
+        places = [_below(root, str(name)) for name in listed]
+        if lost := [name for name, place in zip(listed, places, strict=True) if place is None]:
             missing.append(f"{split}: {', '.join(map(str, lost))}")
-        kept = [there for there in found if there is not None]
-        for there in kept:
-            if (root / there).is_file():
-                _write_list(root, there, folder, new_names)
+        kept = [place for place in places if place is not None]
+        for place in kept:
+            if (root / place).is_file():
+                _write_list(root, place, folder, new_names)
         content[split] = kept if isinstance(content[split], list) else "".join(kept)
         if not kept:
             del content[split]
@@ -175,13 +203,13 @@ def moved_splits(
     return content, missing
 
 
-def _below(root: Path, given: str) -> str | None:
+def _below(root: Path, listed: str) -> str | None:
     """A folder or list of pictures of a split relative to `root`. Roboflow writes "../" before it,
     though it is beside data.yaml."""
-    plain = given
+    plain = listed
     while plain.startswith("../"):
         plain = plain[3:]
-    for name in dict.fromkeys((given, plain)):
+    for name in dict.fromkeys((listed, plain)):
         place = Path(os.path.relpath(root / name, root))
         if ".." not in place.parts and (root / place).exists():
             return place.as_posix()
@@ -201,18 +229,18 @@ def _write_list(
 
 
 def _labels(text: str, size: Size, classes: int, per_keypoint: int) -> tuple[Labels, list[str]]:
-    things, wrong = [], []
+    instances, wrong = [], []
     lines = read_text(text).splitlines() if Path(text).is_file() else []
     for number, line in enumerate(lines, 1):
         if line.strip():
             try:
-                things.append(_thing(line, np.array(size[::-1], float), classes, per_keypoint))
+                instances.append(_instance(line, np.array(size[::-1]), classes, per_keypoint))
             except ValueError as error:
                 wrong.append(f"{text}, line {number}: {error}, got {line.strip()[:80]!r}")
-    return Labels(things, size), wrong
+    return Labels(Instances.joined(instances), size), wrong
 
 
-def _thing(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Thing:
+def _instance(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Instances:
     try:
         category, *rest = map(float, line.split())
         numbers = np.array(rest)
@@ -222,8 +250,8 @@ def _thing(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Thi
     if per_keypoint and len(numbers) > 4 and (len(numbers) - 4) % per_keypoint == 0:
         keypoints = numbers[4:].reshape(-1, per_keypoint)
         numbers = numbers[:4]
-        seen = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
-        keypoints = np.column_stack((keypoints[:, :2] * sides, seen))
+        visibility = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
+        keypoints = np.column_stack((keypoints[:, :2] * sides, visibility))
     is_form = len(numbers) == 4 or (len(numbers) >= 6 and len(numbers) % 2 == 0)
     if not (category in range(classes) and is_form and np.isfinite(numbers).all()):
         raise ValueError(
@@ -239,4 +267,5 @@ def _thing(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Thi
     if not (box[:2] < box[2:]).all():
         raise ValueError("must have an area")
     has_outline = len(table) > 2 and area_of(table) > NO_AREA
-    return Thing(int(category), box, [table] if has_outline else (), keypoints=keypoints)
+    outline = [table] if has_outline else ()
+    return labelled(int(category), box, outline=outline, keypoints=keypoints)

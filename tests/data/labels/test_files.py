@@ -11,10 +11,9 @@ import yaml
 from helpers import refused
 from scenes import write_woodscape
 
-from darswin.boxes import encode_rle
+from darswin.boxes import Instances, encode_rle
 from darswin.data.labels import (
     Labels,
-    Thing,
     moved,
     open_labels,
     read_coco,
@@ -89,16 +88,20 @@ def test_coco_is_read(tmp_path, place, path):
     data = read_coco(write(tmp_path, place, path))
     assert data.folder.samefile(tmp_path / place) and data.lenses is None and len(data) == 3
     assert list(data.files) == ["a.png", "sub/b.png", "c.png"]
-    box, polygon, crowd = data.labels(0).things
-    assert data.labels(0).size == SIZE and not data.labels(2).things
-    np.testing.assert_array_equal(box.box, [10, 20, 40, 35])
-    assert box.category == 18 and not len(box.polygons) and box.area == 450
-    assert box.more == {"id": 5, "image_id": 9, "attributes": {"tame": True}}
-    assert [p.shape for p in polygon.polygons] == [(3, 2), (4, 2)]
-    assert polygon.area == pytest.approx(100 + 5)
-    np.testing.assert_array_equal(polygon.keypoints, [[5, 5, 2], [6, 4, 1], [0, 0, 0]])
-    assert list(polygon.mirror) == [0, 2, 1]
-    assert crowd.crowd and crowd.area == 200 and data.labels(1).things[0].area == 200
+    instances, size, _ = data.labels(0)
+    assert size == SIZE and not len(data.labels(2).instances)
+    np.testing.assert_array_equal(instances.boxes[0], [10, 20, 40, 35])
+    assert instances.labels.tolist() == [18, 1, 1]
+    entry = {"id": 5, "image_id": 9, "attributes": {"tame": True}}
+    assert instances.more["entry"][0] == entry
+    shapes = [[polygon.shape for polygon in outline] for outline in instances.outlines]
+    assert shapes == [[], [(3, 2), (4, 2)], []]
+    assert instances.areas == pytest.approx([450, 100 + 5, 200])
+    person, nothing = [[5, 5, 2], [6, 4, 1], [np.nan, np.nan, 0]], np.full((3, 3), np.nan)
+    np.testing.assert_array_equal(instances.keypoints, [nothing, person, nothing])
+    assert instances.more["mirror"][1] == [0, 2, 1]
+    assert instances.more["crowd"].tolist() == [False, False, True]
+    assert data.labels(1).instances.areas == [200]
 
 
 def test_coco_is_written_and_read_again(tmp_path):
@@ -114,14 +117,15 @@ def test_coco_is_written_and_read_again(tmp_path):
 
 
 def test_ids_are_numbered_where_they_are_missing(tmp_path):
-    labels = Labels([Thing(1, np.array([1.0, 2, 3, 4])), Thing(1, np.array([1.0, 2, 3, 5]))], SIZE)
+    boxes = np.array([[1.0, 2, 3, 4], [1, 2, 3, 5]])
+    labels = Labels(Instances(boxes, labels=np.array([1, 1])), SIZE)
     file = write(tmp_path)
     write_coco(file, [({"file_name": name}, labels) for name in ("a.png", "c.png")], CATEGORIES)
     content = json.loads(file.read_text())
     assert [image["id"] for image in content["images"]] == [1, 2]
     ids = [(annotation["id"], annotation["image_id"]) for annotation in content["annotations"]]
     assert ids == [(1, 1), (2, 1), (3, 2), (4, 2)]
-    assert len(read_coco(file).labels(1).things) == 2
+    assert len(read_coco(file).labels(1).instances) == 2
 
 
 def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
@@ -198,7 +202,7 @@ def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):
     file = write(tmp_path, images=images, annotations=annotations)
     (tmp_path / "images" / "a.png").unlink()
     data = read_coco(file)
-    assert list(data.files) == ["sub/b.png", "c.png"] and len(data.labels(0).things) == 1
+    assert list(data.files) == ["sub/b.png", "c.png"] and len(data.labels(0).instances) == 1
     said = [*(text for _, text in wrong), "no picture a.png in", "no picture d.png in"]
     for text, words in zip(data.wrong, said, strict=True):
         assert str(file) in text and re.search(words, text)
@@ -215,37 +219,49 @@ def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):
 )  # fmt: skip
 def test_what_is_no_outline_is_the_box(tmp_path, changes):
     sides = pictures_with(width="80", height="60.0")
-    thing = read_coco(write(tmp_path, **sides, **changed(0, **changes))).labels(0).things[0]
-    np.testing.assert_array_equal(thing.box, [10, 20, 40, 35])
-    assert not len(thing.polygons) and thing.rle is None and not thing.crowd and not thing.turn
+    found = read_coco(write(tmp_path, **sides, **changed(0, **changes))).labels(0).instances[0]
+    np.testing.assert_array_equal(found.boxes, [[10, 20, 40, 35]])
+    assert not len(found.outlines[0]) and found.masks == [None] and not found.more["crowd"]
 
 
-def test_a_turned_box_of_cvat_is_that_of_its_turned_ellipse(tmp_path):
+def test_a_turned_box_of_cvat_stays_a_turned_one(tmp_path):
+    """As files have it: the outline, the box around it, and the rotation in degrees."""
     turned = changed(0, attributes={"rotation": 30.0, "occluded": True}, visible=0.625)
     data = read_coco(write(tmp_path, **turned))
-    write_coco(tmp_path / "again.json", [(IMAGES[0], data.labels(0))], CATEGORIES)
-    again = json.loads((tmp_path / "again.json").read_text())["annotations"][0]
-    assert again["attributes"] == {"rotation": pytest.approx(30), "occluded": True}
-    assert data.labels(0).things[0].visible == again["visible"] == 0.625
     lens = Equidistant(20.0, 1.6, image_size=SIZE)
-    (thing, *_), *_ = moved(data.labels(0), CropView((0, 0, *SIZE), SIZE).at(lens, SIZE))
-    sin, cos = math.sin(math.radians(30)), math.cos(math.radians(30))
-    half = np.hypot([15 * cos, 15 * sin], [7.5 * sin, 7.5 * cos])
-    middle = np.array([25, 27.5])
-    np.testing.assert_allclose(thing.box, np.r_[middle - half, middle + half], atol=0.01)
-    assert not thing.turn and thing.more["attributes"] == {"occluded": True}
+    remap = CropView((5, 10, *SIZE), SIZE).at(lens, SIZE)
+    write_coco(tmp_path / "again.json", [(IMAGES[0], data.labels(0))], CATEGORIES)
+    for labels, corner in ((data.labels(0), 0), (read_coco(tmp_path / "again.json").labels(0), 0),
+                           (moved(data.labels(0), remap), 5)):  # fmt: skip
+        box, *_ = labels.instances.boxes
+        expected = [25 - 2 * corner, 27.5 - corner, 30, 15, math.radians(30)]
+        np.testing.assert_allclose(box, expected, atol=0.01)
+        write_coco(tmp_path / "again.json", [(IMAGES[0], labels)], CATEGORIES)
+        again = json.loads((tmp_path / "again.json").read_text())["annotations"][0]
+        assert again["attributes"] == {"rotation": pytest.approx(30, abs=0.1), "occluded": True}
+        assert again["visible"] == 0.625 and again["area"] == pytest.approx(450, abs=0.5)
+        middle, sin, cos = box[:2], math.sin(math.radians(30)), math.cos(math.radians(30))
+        half = np.array([15 * cos + 7.5 * sin, 15 * sin + 7.5 * cos])
+        np.testing.assert_allclose(again["bbox"], [*(middle - half), *(2 * half)], atol=0.02)
+        (points,) = again["segmentation"]
+        first = middle - np.array([15 * cos - 7.5 * sin, 15 * sin + 7.5 * cos])
+        np.testing.assert_allclose(points[:2], first, atol=0.02)
+        assert len(points) == 8
+    write_yolo(tmp_path, [({"file_name": "a.png"}, labels)], CATEGORIES)
+    numbers = [*map(float, (tmp_path / "a.txt").read_text().splitlines()[0].split())]
+    np.testing.assert_allclose(np.reshape(numbers[1:], (4, 2))[0] * SIZE[::-1], first, atol=0.02)
 
 
 def test_boxes_that_are_missing_are_those_of_polygons_and_masks(tmp_path):
     _, *others = ANNOTATIONS
     annotations = [{k: v for k, v in a.items() if k not in ("bbox", "id")} for a in others]
-    polygon, crowd = read_coco(write(tmp_path, annotations=annotations)).labels(0).things
-    np.testing.assert_array_equal(polygon.box, [1, 2, 21, 12])
-    np.testing.assert_array_equal(crowd.box, [30, 10, 50, 20])
+    polygon, crowd = read_coco(write(tmp_path, annotations=annotations)).labels(0).instances.boxes
+    np.testing.assert_array_equal(polygon, [1, 2, 21, 12])
+    np.testing.assert_array_equal(crowd, [30, 10, 50, 20])
 
 
 def test_empty_coco_files(tmp_path):
-    assert not read_coco(write(tmp_path, annotations=[])).labels(0).things
+    assert not len(read_coco(write(tmp_path, annotations=[])).labels(0).instances)
     assert len(read_coco(write(tmp_path, images=[], annotations=[], categories=[]))) == 0
 
 
@@ -264,10 +280,10 @@ def test_yolo_is_read(tmp_path):
     data = yolo(tmp_path, "1 0.5 0.5 0.25 0.5\n\n0 0.1 0.1 0.5 0.1 0.5 0.9\n")
     assert list(data.files) == ["images/train/a.png", "images/val/b.png"]
     assert data.categories == [{"id": 0, "name": "person"}, {"id": 1, "name": "dog"}]
-    box, polygon = data.labels(0).things
-    np.testing.assert_allclose(box.box, [30, 15, 50, 45])
-    np.testing.assert_allclose(polygon.polygons[0], [[8, 6], [40, 6], [40, 54]])
-    assert (box.category, polygon.category) == (1, 0) and not data.labels(1).things
+    instances = data.labels(0).instances
+    np.testing.assert_allclose(instances.boxes[0], [30, 15, 50, 45])
+    np.testing.assert_allclose(instances.outlines[1], [[[8, 6], [40, 6], [40, 54]]])
+    assert instances.labels.tolist() == [1, 0] and not len(data.labels(1).instances)
 
 
 @pytest.mark.parametrize(
@@ -285,7 +301,7 @@ def test_where_yolo_has_its_labels(tmp_path, picture, text, classes):
     (tmp_path / text).write_text("0 0.5 0.5 1 1\n")
     (tmp_path / classes).write_text("names: {0: dog}" if classes == "data.yaml" else "dog\n")
     data = open_labels(tmp_path)
-    np.testing.assert_allclose(data.labels(0).things[0].box, [0, 0, 80, 60])
+    np.testing.assert_allclose(data.labels(0).instances.boxes, [[0, 0, 80, 60]])
     write_yolo(tmp_path / "new", [({"file_name": picture}, data.labels(0))], data.categories)
     assert (tmp_path / "new" / text).read_text() == "0 0.500000 0.500000 1.000000 1.000000\n"
 
@@ -296,8 +312,8 @@ def test_yolo_keypoints(tmp_path):
     write_pictures(tmp_path / "new", data.files[0])
     flat = yolo(tmp_path / "flat", "0 .5 .5 .2 .2 .4 .5 0 0\n", kpt_shape=[2, 2])
     for labels in (data, read_yolo(tmp_path / "new"), flat):
-        (thing,) = labels.labels(0).things
-        np.testing.assert_allclose(thing.keypoints, [[32, 30, 2], [0, 0, 0]])
+        (points,) = labels.labels(0).instances.keypoints
+        np.testing.assert_allclose(points, [[32, 30, 2], [np.nan, np.nan, 0]])
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
@@ -305,17 +321,18 @@ def test_parts_of_an_outline_are_joined_for_yolo(tmp_path, parts):
     """What OpenCV fills is the same."""
     corners = np.array([[4.0, 4], [14, 4], [9, 14]])
     polygons = [corners + np.array([20, 10]) * k for k in range(parts)]
-    thing = Thing(0, np.array([4.0, 4, 60, 50]), polygons)
-    labels = Labels([thing, Thing(0, thing.box, crowd=True)], SIZE)
+    columns = dict(boxes=np.array([[4.0, 4, 60, 50]] * 2), labels=np.array([0, 0]))
+    both = Instances(**columns, outlines=[polygons, []], more={"crowd": np.array([False, True])})
+    labels = Labels(both, SIZE)
     write_yolo(tmp_path, [({"file_name": "images/a.png"}, labels)], [{"id": 0, "name": "dog"}])
     write_pictures(tmp_path, "images/a.png")
-    (joined,) = read_yolo(tmp_path).labels(0).things  # without the crowd
+    (joined,) = read_yolo(tmp_path).labels(0).instances.outlines  # without the crowd
     pictures = [np.zeros(SIZE, np.uint8) for _ in range(2)]
-    for picture, shapes in zip(pictures, (polygons, joined.polygons), strict=True):
+    for picture, shapes in zip(pictures, (polygons, joined), strict=True):
         cv2.fillPoly(picture, [np.round(16 * p).astype(int) for p in shapes], 1, shift=4)
     bridges = 2 * np.hypot(20, 10) * (parts - 1)
     assert np.abs(pictures[0].astype(int) - pictures[1]).sum() <= bridges
-    area = cv2.contourArea(joined.polygons[0].astype(np.float32))
+    area = cv2.contourArea(joined[0].astype(np.float32))
     assert area == pytest.approx(50 * parts, abs=0.01)
 
 
@@ -335,7 +352,7 @@ def test_wrong_lines_of_yolo(tmp_path, line, said):
     data = yolo(tmp_path, f"0 0.5 0.5 1 1\n{line}\n")
     refused(rf"a\.txt, line 2: must {said}", data.labels, 0)
     labels, wrong = data.read(data.raw[0], SIZE)
-    assert len(labels.things) == len(wrong) == 1
+    assert len(labels.instances) == len(wrong) == 1
 
 
 def test_folders_that_are_not_yolo(tmp_path):
@@ -355,8 +372,7 @@ def test_folders_that_are_not_yolo(tmp_path):
 def test_the_boxes_of_woodscape(tmp_path):
     data = read_woodscape_boxes(write_woodscape(tmp_path, 4))
     assert data.files[0] == "00000_FV.png" and data.categories == [{"id": 0, "name": "vehicles"}]
-    (thing,) = data.labels(0).things
-    np.testing.assert_array_equal(thing.box, [10, 10, 41, 41])
+    np.testing.assert_array_equal(data.labels(0).instances.boxes, [[10, 10, 41, 41]])
     assert data.lenses is not None and len(open_labels(tmp_path)) == 4
     camera = data.lenses.camera_of(data.folder / data.files[1])
     assert camera.calibration.endswith("00001_RV.json")
@@ -369,4 +385,4 @@ def test_the_boxes_of_woodscape(tmp_path):
         file.write_text(text)
         refused(said, lambda: read_woodscape_boxes(tmp_path).labels(1))
     file.write_text("")
-    assert not read_woodscape_boxes(tmp_path).labels(1).things
+    assert not len(read_woodscape_boxes(tmp_path).labels(1).instances)

@@ -1,0 +1,231 @@
+"""What is found or labelled in a picture: one type for detections and for labels."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
+
+import numpy as np
+
+from darswin.boxes.arrays import PointMap
+from darswin.boxes.carried import carry, carry_points, cut_polygon
+from darswin.boxes.overlap import clip, merge
+from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask, shown_parts
+from darswin.boxes.rle import decode_rle, encode_rle
+from darswin.boxes.turned import as_turned, upright
+
+Size = tuple[int, int]
+_SAMPLES = 1000  # pixels of a mask by which its visible share is measured
+_ROUNDING = 1e-3  # px: a keypoint that is this little beyond the edge of a picture is on it
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """The things that are found or labelled in a picture, as columns of K rows.
+
+    `instances[rows]` are some of them; rows: an index, a slice, or an array. A column is None if
+    nothing is known of it.
+
+    Attributes:
+        boxes: (K, 4) x0, y0, x1, y1 in px, or turned (K, 5), see `darswin.boxes`; NaN if nothing of
+            an instance is shown.
+        scores: (K,).
+        labels: (K,) numbers of classes or ids of categories.
+        keypoints: (K, P, 2 or 3): x and y in px, NaN if they are unknown or not shown, and a score,
+            or COCO's v for labels: 0 unknown, 1 hidden, 2 seen. It is NaN beyond an instance's own
+            keypoints, if others have more.
+        masks: of each, the run lengths of `darswin.boxes.encode_rle`, or None; or the probabilities
+            of pixels (K, h, w), of the picture or of a whole fraction of it.
+        outlines: of each, the parts of its outline, polygons (P, 2); none if it is not known.
+        more: other columns by their names, such as "visible" (K,), the share of an instance that
+            its picture shows, 0 to 1. Each is an array or a list.
+    """
+
+    boxes: np.ndarray
+    scores: np.ndarray | None = None
+    labels: np.ndarray | None = None
+    keypoints: np.ndarray | None = None
+    masks: Sequence[Mapping[str, Any] | None] | np.ndarray | None = None
+    outlines: Sequence[Sequence[np.ndarray]] | None = None
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __getitem__(self, rows: Any) -> Self:
+        number = np.atleast_1d(np.arange(len(self))[rows])
+
+        def taken(column: Any) -> Any:
+            if column is None or isinstance(column, np.ndarray):
+                return None if column is None else column[number]
+            return [column[k] for k in number.tolist()]
+
+        columns = {name: taken(column) for name, column in self._columns()}
+        more = {name: taken(column) for name, column in self.more.items()}
+        return replace(self, **columns, more=more)
+
+    def _columns(self) -> Iterator[tuple[str, Any]]:
+        return ((of.name, getattr(self, of.name)) for of in fields(self) if of.name != "more")
+
+    def with_columns(self, **more: Any) -> Self:
+        """The same instances with these columns in `more`."""
+        return replace(self, more={**self.more, **more})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The instances of all parts, one after another. Of `more`, the columns that all have."""
+        if not parts:
+            return cls(np.zeros((0, 4)), labels=np.zeros(0, int))
+        columns = {name: [getattr(part, name) for part in parts] for name, _ in parts[0]._columns()}
+        if len({table.shape[1] for table in columns["boxes"]}) > 1:
+            columns["boxes"] = [as_turned(table) for table in columns["boxes"]]
+        if any(points is not None for points in columns["keypoints"]):
+            columns["keypoints"] = _padded(columns["keypoints"], [*map(len, parts)])
+        for name, unknown in (("masks", None), ("outlines", ())):
+            if any(column is not None for column in columns[name]):
+                each = zip(columns[name], parts, strict=True)
+                columns[name] = [[unknown] * len(p) if c is None else c for c, p in each]
+        names = [name for name in parts[0].more if all(name in part.more for part in parts)]
+        more = {name: _concatenated([part.more[name] for part in parts]) for name in names}
+        return cls(**{name: _concatenated(of) for name, of in columns.items()}, more=more)
+
+    def merged(self, *, iou: float = 0.5, inside: float = 0.7) -> Self:
+        """The best of those that show the same thing, the best first; see `darswin.boxes.merge`."""
+        return self[merge(self.boxes, self.scores, self.labels, iou=iou, inside=inside)]
+
+    @property
+    def upright(self) -> np.ndarray:
+        """The boxes, or the upright ones around turned boxes, (K, 4)."""
+        return upright(self.boxes)
+
+    @property
+    def areas(self) -> np.ndarray:
+        """px², of the masks, the outlines, or else the boxes, (K,)."""
+        areas = np.prod(as_turned(self.boxes)[:, 2:4], axis=1)
+        for k in range(len(self)):
+            if self.masks is not None and self.masks[k] is not None:
+                areas[k] = decode_rle(self.masks[k]).sum()
+            elif self.outlines is not None and len(self.outlines[k]):
+                areas[k] = sum(map(area_of, self.outlines[k]))
+        return areas
+
+    def through(
+        self, points_map: PointMap, size: Size, *, cut: Size | None = None,
+        masks: Callable[[np.ndarray], np.ndarray] | None = None, rays: PointMap | None = None,
+    ) -> Self:  # fmt: skip
+        """The instances in another picture, in the same order.
+
+        Outlines and keypoints move point by point, and masks pixel by pixel; boxes are those of
+        what is left of outlines and masks, or else of the ellipses inside them. All end at the
+        borders of the new picture, and where it shows nothing.
+
+        Args:
+            points_map: from this picture to the new one.
+            size: (H, W) of the new picture.
+            cut: (H, W) of this picture, if upright boxes end at its borders.
+            masks: resamples a mask (H, W), bool, to the new picture. Without it, masks are left
+                out, and boxes do not follow them.
+            rays: from points of this picture to rays.
+
+        Returns:
+            The instances with "visible" (K,), the share that is shown, which counts from the first
+            picture; and with "rays" (K, 3) if `rays` is given: the directions of the middles of the
+            boxes here, 0 where there are none. Of what is not shown at all, boxes are NaN.
+        """
+        old = self.boxes
+        if cut is not None:
+            old = clip(old, cut) if old.shape[1] == 4 else old
+            old = np.where((as_turned(old)[:, 2:4] > 0).all(1)[:, None], old, np.nan)
+        by_mask = _known(None if masks is None else self.masks, len(old))
+        by_outline = _known(self.outlines, len(old)) & ~by_mask
+        alone = ~(by_mask | by_outline)
+        boxes, visible = np.zeros(old.shape), np.zeros(len(old))
+        boxes[alone], visible[alone] = carry(old[alone], points_map, size)
+        columns: dict[str, Any] = {"masks": None, "outlines": None}
+        if self.outlines is not None:
+            columns["outlines"] = [[] for _ in old]
+            rows = np.flatnonzero(by_outline).tolist()
+            moved = _outlines_through([self.outlines[k] for k in rows], points_map, size)
+            for k, (outline, share) in zip(rows, moved, strict=True):
+                boxes[k, :4], columns["outlines"][k], visible[k] = box_of(outline), outline, share
+        if masks is not None and self.masks is not None:
+            columns["masks"] = [None for _ in old]
+            for k in np.flatnonzero(by_mask).tolist():
+                mask, share = _mask_through(self.masks[k], points_map, size, masks)
+                boxes[k, :4], visible[k] = box_of_mask(mask), share
+                compressed = isinstance(self.masks[k]["counts"], str)
+                columns["masks"][k] = encode_rle(mask, compressed=compressed)
+        if boxes.shape[1] == 5:
+            boxes[~alone] = as_turned(boxes[~alone, :4])
+        more = dict(self.more) | {"visible": visible * self.more.get("visible", 1.0)}
+        if rays is not None:
+            more["rays"] = np.nan_to_num(rays(as_turned(old)[:, :2] - 0.5))
+        columns["keypoints"] = _keypoints_through(self.keypoints, points_map, size)
+        return replace(self, boxes=boxes, more=more, **columns)
+
+
+def _known(column: Sequence[Any] | None, count: int) -> np.ndarray:
+    """The rows of a column of outlines or masks of which something is known, (K,)."""
+    if column is None:
+        return np.zeros(count, bool)
+    return np.array([value is not None and len(value) > 0 for value in column], bool)
+
+
+def _concatenated(parts: Sequence[Any]) -> Any:
+    """The values of a column of several parts; None if all have none."""
+    if all(part is None for part in parts):
+        return None
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    return [value for part in parts for value in part]
+
+
+def _padded(parts: Sequence[np.ndarray | None], counts: Sequence[int]) -> list[np.ndarray]:
+    """Keypoints of several parts, with rows of NaN up to the largest number of points."""
+    shapes = [part.shape[1:] for part in parts if part is not None]
+    most, width = max(shape[0] for shape in shapes), shapes[0][1]
+    padded = [np.full((count, most, width), np.nan) for count in counts]
+    for table, part in zip(padded, parts, strict=True):
+        if part is not None:
+            table[:, : part.shape[1]] = part
+    return padded
+
+
+def _outlines_through(
+    outlines: Sequence[Sequence[np.ndarray]], points_map: PointMap, size: Size
+) -> Iterator[tuple[list[np.ndarray], float]]:
+    """The parts of each outline that are shown, and their share of its area."""
+    lines = [[*map(cut_polygon, polygons)] for polygons in outlines]
+    shown = iter(shown_parts(
+        [line for polygons in lines for line in polygons],
+        lambda points: carry_points(points, points_map), size,
+    ))  # fmt: skip
+    for polygons in lines:
+        parts, shares = zip(*(next(shown) for _ in polygons), strict=True)
+        areas = [area_of(polygon) for polygon in polygons]
+        share = np.average(shares, weights=areas if sum(areas) > NO_AREA else None)
+        yield [part.new for of_polygon in parts for part in of_polygon], float(share)
+
+
+def _mask_through(
+    rle: Mapping[str, Any], points_map: PointMap, size: Size,
+    masks: Callable[[np.ndarray], np.ndarray],
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """The new mask (H, W), and the share of its pixels that are shown."""
+    old = decode_rle(rle)
+    new = masks(old)
+    if not new.any():
+        return new, 0.0
+    pixels = np.argwhere(old)[:: 1 + old.sum() // _SAMPLES, ::-1]
+    points = points_map(pixels.astype(float)) + 0.5
+    return new, float(((points >= 0) & (points <= size[::-1])).all(1).mean())  # False for NaN
+
+
+def _keypoints_through(
+    keypoints: np.ndarray | None, points_map: PointMap, size: Size
+) -> np.ndarray | None:
+    if keypoints is None:
+        return None
+    points = carry_points(keypoints[..., :2], points_map)
+    inside = (points >= -_ROUNDING) & (points <= np.add(size[::-1], _ROUNDING))
+    points = np.where(inside.all(-1, keepdims=True), points.clip(0, size[::-1]), np.nan)
+    return np.concatenate((points, keypoints[..., 2:]), -1)
