@@ -15,15 +15,18 @@ import argparse
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from pretrained_scenes import COCO
 
-from darswin import boxes, lens
-from darswin.frames.onnx import Detections, OnnxNetwork
+from darswin import lens
+from darswin.boxes import Instances
+from darswin.frames.onnx import OnnxNetwork
 from darswin.lens import Lens
+from darswin.models.detections import in_picture
 from darswin.utils.image import read_image
 from darswin.views import Remap, make_view, up_of
 from darswin.viz.pixels import draw_boxes
@@ -34,40 +37,36 @@ SLICES = {2: 0.56, 3: 0.5}  # the side of a slice in parts of the picture's, by 
 COLOR = (255, 220, 0)
 
 
-def seen_by(network: OnnxNetwork, picture: np.ndarray) -> Detections:
+def seen_by(network: OnnxNetwork, picture: np.ndarray) -> Instances:
     """The detections in a flat picture (H, W, 3) of any size, which black rows make square."""
     scale = SIDE / max(picture.shape[:2])
     width, height = (round(scale * side) for side in picture.shape[1::-1])
     image = np.zeros((SIDE, SIDE, 3), np.float32)
     image[:height, :width] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     (found,) = network(np.ascontiguousarray(image.transpose(2, 0, 1)[None]))
-    return found._replace(boxes=found.boxes / scale)
+    return replace(found, boxes=found.boxes / scale)
 
 
-def slices(network: OnnxNetwork, picture: np.ndarray, count: int) -> list[Detections]:
+def slices(network: OnnxNetwork, picture: np.ndarray, count: int) -> list[Instances]:
     """In `count` × `count` overlapping parts of the picture."""
     found = []
     height, width = (round(SLICES[count] * side) for side in picture.shape[:2])
     for y in np.linspace(0, picture.shape[0] - height, count).round().astype(int):
         for x in np.linspace(0, picture.shape[1] - width, count).round().astype(int):
             part = seen_by(network, picture[y : y + height, x : x + width])
-            found.append(part._replace(boxes=part.boxes + np.array([x, y, x, y])))
+            found.append(replace(part, boxes=part.boxes + np.array([x, y, x, y])))
     return found
 
 
-def through(network: OnnxNetwork, picture: np.ndarray, remap: Remap) -> list[Detections]:
-    """In a view, or in each of its tiles."""
+def through(network: OnnxNetwork, picture: np.ndarray, remap: Remap) -> list[Instances]:
+    """In a view, or in all of its tiles together."""
     images = remap.sampler("image", mean=MEAN, std=STD)(picture).reshape(-1, 3, SIDE, SIDE)
-    parts = []
-    for tile, found in zip(remap.tiles, network(images), strict=True):
-        moved, visible, _ = tile.boxes_to_image(found.boxes.astype(float))
-        parts.append(Detections(*(of[visible > 0] for of in (moved, found.scores, found.labels))))
-    return parts
+    return [in_picture(remap, network(images))]
 
 
 def look(
     way: str, network: OnnxNetwork, picture: np.ndarray, camera: Lens, up: Sequence[float]
-) -> Detections:
+) -> Instances:
     """What is found in one way: "raw", "slices:2" with the whole picture, or a view's name."""
     kind, _, count = way.partition(":")
     if kind in ("raw", "slices"):
@@ -77,10 +76,7 @@ def look(
         options = {"count": int(count)} if count else {}
         view = make_view(kind, (SIDE, SIDE), up=tuple(up), **options)
         parts = through(network, picture, view.at(camera, picture.shape[:2]))
-    columns = zip(*((part.boxes, part.scores, part.labels) for part in parts), strict=True)
-    found = [np.concatenate(column) for column in columns]
-    kept = boxes.merge(*found)
-    return Detections(*(column[kept] for column in found))
+    return Instances.joined(parts).merged()
 
 
 def up_in(calibration: Path, pitch: float) -> tuple[float, float, float]:
@@ -91,7 +87,7 @@ def up_in(calibration: Path, pitch: float) -> tuple[float, float, float]:
         return up_of(pitch=-math.radians(pitch))
 
 
-def drawn(title: str, picture: np.ndarray, found: Detections, width: int) -> np.ndarray:
+def drawn(title: str, picture: np.ndarray, found: Instances, width: int) -> np.ndarray:
     """The picture of a width with its boxes, below a title."""
     scale = width / picture.shape[1]
     size = width, round(scale * picture.shape[0])

@@ -14,6 +14,7 @@ from darswin.boxes.rle import decode_rle, encode_rle
 from darswin.boxes.turned import as_turned, upright
 
 Size = tuple[int, int]
+Column = Any  # an array or a list of K values, or None
 _SAMPLES = 1000  # pixels of a mask by which its visible share is measured
 _ROUNDING = 1e-3  # px: a keypoint that is this little beyond the edge of a picture is on it
 
@@ -41,11 +42,11 @@ class Instances:
     """
 
     boxes: np.ndarray
-    scores: np.ndarray | None = None
-    labels: np.ndarray | None = None
-    keypoints: np.ndarray | None = None
-    masks: Sequence[Mapping[str, Any] | None] | np.ndarray | None = None
-    outlines: Sequence[Sequence[np.ndarray]] | None = None
+    scores: Column = None
+    labels: Column = None
+    keypoints: Column = None
+    masks: Column = None
+    outlines: Column = None
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -134,19 +135,21 @@ class Instances:
         old = self.boxes
         if cut is not None:
             old = clip(old, cut) if old.shape[1] == 4 else old
-            old = np.where((as_turned(old)[:, 2:4] > 0).all(1)[:, None], old, np.nan)
+            has_area = (as_turned(old)[:, 2:4] > 0).all(1, keepdims=True)
+            old = np.where(has_area, old, np.nan)
         by_mask = _known(None if masks is None else self.masks, len(old))
         by_outline = _known(self.outlines, len(old)) & ~by_mask
         alone = ~(by_mask | by_outline)
         boxes, visible = np.zeros(old.shape), np.zeros(len(old))
         boxes[alone], visible[alone] = carry(old[alone], points_map, size)
-        columns: dict[str, Any] = {"masks": None, "outlines": None}
+        columns: dict[str, Column] = {"masks": None, "outlines": None}
         if self.outlines is not None:
             columns["outlines"] = [[] for _ in old]
             rows = np.flatnonzero(by_outline).tolist()
             moved = _outlines_through([self.outlines[k] for k in rows], points_map, size)
             for k, (outline, share) in zip(rows, moved, strict=True):
-                boxes[k, :4], columns["outlines"][k], visible[k] = box_of(outline), outline, share
+                boxes[k, :4], visible[k] = box_of(outline), share
+                columns["outlines"][k] = outline
         if masks is not None and self.masks is not None:
             columns["masks"] = [None for _ in old]
             for k in np.flatnonzero(by_mask).tolist():
@@ -154,7 +157,7 @@ class Instances:
                 boxes[k, :4], visible[k] = box_of_mask(mask), share
                 compressed = isinstance(self.masks[k]["counts"], str)
                 columns["masks"][k] = encode_rle(mask, compressed=compressed)
-        if boxes.shape[1] == 5:
+        if old.shape[1] == 5:
             boxes[~alone] = as_turned(boxes[~alone, :4])
         more = dict(self.more) | {"visible": visible * self.more.get("visible", 1.0)}
         if rays is not None:

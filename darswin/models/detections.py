@@ -129,11 +129,11 @@ def _rows(detections: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _instances(detections: Mapping[str, Tensor]) -> Instances:
-    boxes, scores, keypoints = (
-        None if value is None else value.detach().to("cpu", torch.float64).numpy()
-        for value in map(detections.get, ("boxes", "scores", "keypoints"))
-    )
-    return Instances(boxes, scores, detections["labels"].cpu().numpy(), keypoints)
+    columns: dict[str, Any] = {
+        name: detections[name].detach().to("cpu", torch.float64).numpy()
+        for name in ("boxes", "scores", "labels", "keypoints") if name in detections
+    }  # fmt: skip
+    return Instances(**columns)
 
 
 def _masks_in_image(masks: Tensor, tiles: Tensor, remap: Remap) -> Tensor:

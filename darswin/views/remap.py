@@ -159,11 +159,11 @@ class Remap:
         rays_of = None if self.lens is None else rays
         moved = Instances(table).through(points_map, sizes[1], cut=sizes[0], rays=rays_of)
         columns = moved.boxes, moved.more["visible"], moved.more.get("rays")
-        if isinstance(boxes, Tensor):
-            dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
-            like = partial(torch.as_tensor, dtype=dtype, device=boxes.device)
-            columns = tuple(None if column is None else like(column) for column in columns)
-        return columns
+        if not isinstance(boxes, Tensor):
+            return columns
+        dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
+        like = partial(torch.as_tensor, dtype=dtype, device=boxes.device)
+        return like(columns[0]), like(columns[1]), None if columns[2] is None else like(columns[2])
 
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):

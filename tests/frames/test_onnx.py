@@ -35,7 +35,8 @@ def check_found(found, expected=BOXES):
     for one, known in zip(found, expected, strict=True):
         assert one.boxes.dtype == np.float64 and one.labels.dtype == np.int64
         if known is None:
-            assert [values.shape for values in one[:3]] == [(0, 4), (0,), (0,)]
+            columns = one.boxes, one.scores, one.labels
+            assert [column.shape for column in columns] == [(0, 4), (0,), (0,)]
             continue
         (x0, y0, x1, y1), channel = known
         area, by = (x1 - x0) * (y1 - y0), 2 if x0 == 0 else 1
