@@ -73,7 +73,7 @@ def calibrate(
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import calibrate as found_by
     from darswin.calibrate.doubts import out_of_reach
-    from darswin.cli.pictures import check_paths, pictures_and_videos
+    from darswin.cli.pictures import files_at
     from darswin.utils.progress import Progress
 
     given = {"marker": marker, "gap": gap, "dictionary": dictionary, "first_tag": first_tag}
@@ -86,8 +86,7 @@ def calibrate(
         figure_format(picture)
     if theta_max_deg is not None:
         check("theta_max_deg", theta_max_deg, 0 < theta_max_deg <= 180, "above 0, at most 180")
-    check_paths(pictures)
-    names = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
+    names = [file.name for file in files_at(pictures) if not file.is_video]
     outs = {"out": out, "picture": picture, "report": report}
     for option, file in outs.items():
         (check_lens_out if option == "out" else check_out)(file, names, option)

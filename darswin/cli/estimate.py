@@ -32,15 +32,14 @@ def estimate(
     """
     # These import OpenCV and Pillow, which other commands of `lens` do not need.
     from darswin.calibrate import estimate as estimate_lens
-    from darswin.cli.pictures import check_paths, pictures_and_videos
+    from darswin.cli.pictures import files_at
     from darswin.utils.image import read_stored
 
     if not pictures:
         raise ValueError("missing pictures: give files or folders")
     if fov_deg is not None:
         check("fov_deg", fov_deg, 0 < fov_deg < 360, "above 0° and below 360°")
-    check_paths(pictures)
-    files = [file.name for file in pictures_and_videos(pictures) if not file.is_video]
+    files = [file.name for file in files_at(pictures) if not file.is_video]
     if not files:
         raise ValueError(f"no pictures in {', '.join(pictures)}")
     check_lens_out(out, files)

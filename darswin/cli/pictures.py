@@ -1,35 +1,92 @@
-"""The pictures and videos of commands: their files, what is made of each lens once, the folder that
-is written to, and the files that cannot be read.
+"""The door by which pictures come into commands: files, folders, videos and streams, with their
+turns and lenses; what is made of each lens once; the files that cannot be read; and the folder that
+is written to.
 """
 
 import json
 import os
 import re
-from collections.abc import Callable, Hashable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
 
 from darswin.cli.arguments import can_write
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.lens import Lens
 from darswin.utils.files import check_is_file, replace_file
-from darswin.utils.image import BrokenImageError
+from darswin.utils.image import BrokenImageError, read_header, read_oriented
 from darswin.utils.parameters import with_flags
-from darswin.utils.video import is_stream, is_video, stream_name
+from darswin.utils.video import is_stream, is_video, read_frames, read_stream, stream_name
+
+if TYPE_CHECKING:
+    from darswin.data.cameras import Calibrations
 
 Made = TypeVar("Made")
 
 
+class Picture(NamedTuple):
+    """An upright picture or frame, (H, W, C) uint8, with its lens; entry: its name as JSON."""
+
+    entry: dict[str, Any]
+    image: np.ndarray
+    lens: Lens
+
+
 class File(NamedTuple):
-    """A picture or a video."""
+    """A picture, or a video or stream."""
 
     name: str
     is_video: bool
 
+    @property
+    def said(self) -> str:
+        """The name without a user and a password."""
+        return stream_name(self.name)
 
-def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
-    """The files at the paths; a folder stands for all pictures and videos in it."""
+    def pictures(
+        self, lenses: "Calibrations", channels: int | None = None, every: int = 1
+    ) -> Iterator[Picture]:
+        """The picture, or each `every`-th frame. Without `channels`, it has those of the file.
+
+        Raises:
+            BrokenImageError: the file cannot be read, or has no lens that fits.
+        """
+
+        def picture(entry: dict[str, Any], image: np.ndarray, orientation: int) -> Picture:
+            try:
+                lens = lenses.lens_of(self.said, (image.shape[0], image.shape[1]), orientation)
+            except ValueError as error:
+                raise BrokenImageError(with_flags(error)) from error
+            return Picture(entry, image, lens)
+
+        if not self.is_video:
+            if channels is None:
+                with warnings.catch_warnings(action="ignore"):  # Pillow's, about what it skips
+                    channels = read_header(self.name).channels
+            yield picture({"image": self.name}, *read_oriented(self.name, channels))
+            return
+        read = read_stream if is_stream(self.name) else read_frames
+        for frame in read(self.name, channels or 3, every):
+            time = round(frame.time, 6)
+            entry = {"video": self.said, "frame": frame.number, "time": time}
+            yield picture(entry, frame.image, frame.orientation)
+
+
+def files_at(
+    paths: Sequence[str], *, leave_out: str | None = None, streams: bool = False
+) -> list[File]:
+    """The files at the paths; a folder stands for all pictures and videos in it, but for those
+    below the folder `leave_out`.
+
+    Raises:
+        FileNotFoundError: it lists all that are missing.
+        ValueError: a pipe, a device or a socket.
+    """
+    check_paths(path for path in paths if not (streams and is_stream(path)))
     files: list[File] = []
     for path in paths:
         names = [str(path)]
@@ -43,8 +100,9 @@ def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> l
     return files
 
 
-def check_paths(paths: Sequence[str]) -> None:
+def check_paths(paths: Iterable[str]) -> None:
     """FileNotFoundError that lists all missing files; ValueError for pipes, devices and sockets."""
+    paths = list(paths)
     if missing := [path for path in paths if not os.path.exists(path)]:
         raise FileNotFoundError(f"there is no file or folder {', '.join(missing)}")
     for path in paths:

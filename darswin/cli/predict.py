@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from darswin.cli.answers import (
     ANSWERS_OF,
     TOP,
@@ -16,27 +14,27 @@ from darswin.cli.answers import (
     ClassAnswers,
 )
 from darswin.cli.arguments import check_out
-from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
+from darswin.cli.lenses import given_lenses, lenses_of_run
 from darswin.cli.options import check_folder
 from darswin.cli.pictures import (
     Broken,
+    File,
     check_paths,
     claim_folder,
     file_names,
-    pictures_and_videos,
+    files_at,
 )
 from darswin.compat import load_official
+from darswin.data.cameras import Calibrations
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.frames.recognise import TASKS
-from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import replace_file
-from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.parameters import check, naming
 from darswin.utils.tensor_files import read_metadata
-from darswin.utils.video import is_stream, read_frames, read_stream, stream_name
+from darswin.utils.video import is_stream
 
 ANSWERS = "predictions.json"
 AnyTask = Literal["classification", "segmentation", "distance", "detect", "pose", "obb", "segment"]
@@ -155,7 +153,7 @@ def predict(
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
-    check_paths([path for path in paths if not is_stream(path)])
+    check_paths(path for path in paths if not is_stream(path))
     if network is None:
         kind, make = _of_model(weights, TOP if top is None else top)
     else:
@@ -171,8 +169,8 @@ def predict(
         text = f"`top` is for the classes of pictures, but {weights} is a model for {kind}"
         raise naming(ValueError(text), "top")
     prints = kind in ("classification", "numbers")
-    files = pictures_and_videos(paths, leave_out=None if prints else out)
-    names = [stream_name(file.name) for file in files]
+    files = files_at(paths, leave_out=None if prints else out, streams=True)
+    names = [file.said for file in files]
     read = [*names, str(weights), *([] if lens is None else [lens])]
     check_out(out, read, may_be_folder=not prints)
     if lens is not None:
@@ -187,12 +185,7 @@ def predict(
     try:
         for file in files:
             with broken.skipped():
-                if file.is_video:
-                    answer_video(file.name, every, lenses, answers)
-                else:
-                    image, orientation = read_oriented(file.name, answers.channels)
-                    taken_with = _lens(lenses, file.name, image, orientation)
-                    answers.add({"image": file.name}, image, taken_with)
+                answer(file, lenses[file.said], every, answers)
     finally:  # keep the predictions so far
         try:
             answers.flush()
@@ -224,43 +217,34 @@ def _of_model(
     return card.task, make
 
 
-def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> None:
-    """Predicts the frames of a video or a camera, and prints the speed. Ctrl-C ends a camera."""
-    live = is_stream(name)
-    frames_of, said = (read_stream, stream_name(name)) if live else (read_frames, name)
-    answers.flush()
+def answer(file: File, lenses: Calibrations, every: int, answers: Answers) -> None:
+    """Predicts a picture, or the frames of a video or a camera, and prints the speed. Ctrl-C ends a
+    camera."""
+    if file.is_video:
+        answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
-        for frame in frames_of(name, answers.channels, every):
-            taken_with = _lens(lenses, said, frame.image, frame.orientation)
-            entry = {"video": said, "frame": frame.number, "time": round(frame.time, 6)}
-            answers.add(entry, frame.image, taken_with)
+        for picture in file.pictures(lenses, answers.channels, every):
+            answers.add(*picture)
     except KeyboardInterrupt:
-        if not live:
+        if not is_stream(file.name):
             raise
     finally:
-        answers.flush()
-        seconds, network = time.perf_counter() - start, answers.seconds - before
-        if frames := len(answers.found) - done:
-            speed = {
-                "frames": frames,
-                "frames_per_second": round(frames / seconds, 1),
-                "network_frames_per_second": round(frames / network, 1),
-            }
-            answers.found.append({"video": said, **speed})
-            print(
-                f"darswin: {said}: {frames} frames at {frames / seconds:.1f} frames/s; "
-                f"the network alone: {frames / network:.1f} frames/s",
-                file=sys.stderr,
-            )
-
-
-def _lens(lenses: Lenses, name: str, image: np.ndarray, orientation: int) -> Lens:
-    """The lens of an upright picture or frame; BrokenImageError if none fits."""
-    try:
-        return lenses[name].lens_of(name, (image.shape[0], image.shape[1]), orientation)
-    except ValueError as error:
-        raise BrokenImageError(str(error)) from error
+        if file.is_video:
+            answers.flush()
+            seconds, network = time.perf_counter() - start, answers.seconds - before
+            if frames := len(answers.found) - done:
+                speed = {
+                    "frames": frames,
+                    "frames_per_second": round(frames / seconds, 1),
+                    "network_frames_per_second": round(frames / network, 1),
+                }
+                answers.found.append({"video": file.said, **speed})
+                print(
+                    f"darswin: {file.said}: {frames} frames at {frames / seconds:.1f} frames/s; "
+                    f"the network alone: {frames / network:.1f} frames/s",
+                    file=sys.stderr,
+                )
 
 
 def trained_model(path: str | Path) -> tuple[Any, ModelCard]:

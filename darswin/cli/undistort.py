@@ -2,8 +2,8 @@
 
 import json
 import math
-import warnings
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,7 +20,7 @@ from darswin.utils.parameters import check, with_flags
 if TYPE_CHECKING:
     import numpy as np
 
-    from darswin.cli.pictures import Broken
+    from darswin.cli.pictures import Broken, File, Picture
     from darswin.data.cameras import Calibrations
     from darswin.frames import Sampler
 
@@ -72,14 +72,7 @@ def undistort(
         coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
-    from darswin.cli.pictures import (
-        Broken,
-        check_paths,
-        claim_folder,
-        is_below,
-        pictures_and_videos,
-        relative_names,
-    )
+    from darswin.cli.pictures import Broken, claim_folder, files_at, is_below, relative_names
     from darswin.data.cameras import Calibrations, is_json
     from darswin.utils.progress import Progress
 
@@ -94,27 +87,25 @@ def undistort(
         check("size", size, view != "square" or size[0] == size[1], "square for this view")
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
-    check_paths(paths)
+    files = files_at(paths, leave_out=out)
     if inside := [path for path in paths if is_below(path, out)]:
         raise ValueError(f"--out must be a folder without the originals, but has {inside[0]}")
     root = "." if is_json(calib) else Path(calib).parent
     calibrations = Calibrations(calib, root, camera, coefficients)
-    files = pictures_and_videos(paths, leave_out=out)
     if not files:
         raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of --out")
     folder = claim_folder(out, RECORD)
     (folder / LENS).unlink(missing_ok=True)
-    views = _Views(calibrations, look, size, theta_max_deg)
+    views = _Views(look, size, theta_max_deg)
     names = relative_names(paths, files)
     broken = Broken()
     written: dict[str, Lens | None] = {}
     try:
         with Progress("undistort", len(files)) as progress:
             for file in files:
-                undistort_file = _video if file.is_video else _picture
                 with broken.skipped(ValueError):
-                    target, lens = undistort_file(
-                        file.name, folder / names[file.name], views, broken
+                    target, lens = _undistorted(
+                        file, calibrations, folder / names[file.name], views, broken
                     )
                     written[target.relative_to(folder).as_posix()] = lens
                 progress.done += 1
@@ -135,14 +126,10 @@ class _Viewed(NamedTuple):
 class _Views:
     """The views of pictures, planned once for each lens."""
 
-    def __init__(
-        self, calibrations: "Calibrations", look: Look, size: tuple[int, int] | None,
-        theta_max_deg: float | None,
-    ):  # fmt: skip
+    def __init__(self, look: Look, size: tuple[int, int] | None, theta_max_deg: float | None):
         from darswin.cli.pictures import ByLens
 
-        self._calibrations, self._look = calibrations, look
-        self._size, self._theta_max_deg = size, theta_max_deg
+        self._look, self._size, self._theta_max_deg = look, size, theta_max_deg
         self._by_lens = ByLens()
         self._said: set[str] = set()
 
@@ -152,10 +139,11 @@ class _Views:
         (shape,) = self._said if len(self._said) == 1 else ("in several sizes",)
         return f"{self._look.view} view, {shape}"
 
-    def of(self, name: str, size: tuple[int, int], orientation: int, even: bool) -> _Viewed:
-        """The view of an upright picture of (H, W); `even` makes its sides even."""
-        lens = self._calibrations.lens_of(Path(name), size, orientation)
-        return self._by_lens(lens, lambda: self._planned(lens, size, even), even)
+    def of(self, picture: "Picture", even: bool) -> _Viewed:
+        """The view of a picture; `even` makes its sides even."""
+        height, width, _ = picture.image.shape
+        planned = partial(self._planned, picture.lens, (height, width), even)
+        return self._by_lens(picture.lens, planned, even)
 
     def _planned(self, lens: Lens, size: tuple[int, int], even: bool) -> _Viewed:
         exact = lens.to(torch.float64)
@@ -176,43 +164,34 @@ class _Views:
         return _Viewed(remap.sampler(), remap.camera)
 
 
-def _picture(name: str, target: Path, views: _Views, _: "Broken") -> tuple[Path, Lens | None]:
-    """Undistorts a picture; returns its new path and the camera of the view."""
-    from darswin.utils.image import read_header, read_oriented, write_image, written_as
-
-    with warnings.catch_warnings(action="ignore"):  # Pillow's, about what it skips
-        channels = read_header(name).channels
-    image, orientation = read_oriented(name, channels)
-    viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
-    picture = viewed.sampler(image)
-    target = written_as(target)
-    write_image(target, picture)
-    return target, viewed.camera
-
-
-def _video(name: str, target: Path, views: _Views, broken: "Broken") -> tuple[Path, Lens | None]:
-    """`_picture` for a video. If it is cut off, the frames before are written."""
+def _undistorted(
+    file: "File", calibrations: "Calibrations", target: Path, views: _Views, broken: "Broken"
+) -> tuple[Path, Lens | None]:
+    """Undistorts a picture or a video; returns its new path and the camera of the view. If a video
+    is cut off, the frames before are written."""
     from darswin.utils import video
-    from darswin.utils.image import BrokenImageError
+    from darswin.utils.image import BrokenImageError, write_image, written_as
 
-    cameras: list[Lens | None] = []
+    pictures = file.pictures(calibrations)
+    first = next(pictures)
+    viewed = views.of(first, even=file.is_video)
+    if not file.is_video:
+        target = written_as(target)
+        write_image(target, viewed.sampler(first.image))
+        return target, viewed.camera
 
-    def undistorted() -> "Iterator[np.ndarray]":
+    def frames() -> "Iterator[np.ndarray]":
+        yield viewed.sampler(first.image)
         try:
-            for frame in video.read_frames(name):
-                size = frame.image.shape[0], frame.image.shape[1]
-                viewed = views.of(name, size, frame.orientation, even=True)
-                cameras[:] = [viewed.camera]
-                yield viewed.sampler(frame.image)
+            for picture in pictures:
+                yield views.of(picture, even=True).sampler(picture.image)
         except BrokenImageError as error:
-            if not cameras:
-                raise
             broken.errors.append(with_flags(error))
 
     if target.suffix.lower() not in video.WRITTEN:
         target = target.with_name(f"{target.name}.mp4")
-    video.write_frames(target, undistorted(), video.frame_rate(name))
-    return target, cameras[0]
+    video.write_frames(target, frames(), video.frame_rate(file.name))
+    return target, viewed.camera
 
 
 def _write_lens(folder: Path, written: dict[str, Lens | None]) -> None:
