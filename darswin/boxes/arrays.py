@@ -23,13 +23,13 @@ def floats(value: Any) -> np.ndarray:
     return np.asarray(to_numpy(value.double() if _is_tensor(value) else value), np.float64)
 
 
-def like(given: Any, value: np.ndarray) -> Any:
-    """A result with the kind, device and floating dtype of what was given."""
-    if _is_tensor(given):
+def like(original: Any, value: np.ndarray) -> Any:
+    """A result with the kind, device and floating dtype of what was original."""
+    if _is_tensor(original):
         torch = sys.modules["torch"]
-        dtype = given.dtype if value.dtype.kind == "f" and given.is_floating_point() else None
-        return torch.from_numpy(np.ascontiguousarray(value)).to(given.device, dtype)
-    dtype = np.asarray(given).dtype.newbyteorder("=")
+        dtype = original.dtype if value.dtype.kind == "f" and original.is_floating_point() else None
+        return torch.from_numpy(np.ascontiguousarray(value)).to(original.device, dtype)
+    dtype = np.asarray(original).dtype.newbyteorder("=")
     both_float = value.dtype.kind == "f" and dtype.kind == "f"
     return value.astype(dtype, copy=False) if both_float else value
 
@@ -52,6 +52,6 @@ def shape_of(array: np.ndarray) -> str:
 def through(points_map: PointMap, points: np.ndarray) -> np.ndarray:
     """Points of COCO through a map of darswin's pixels; both coordinates are NaN if one is not
     finite."""
-    found = np.asarray(points_map(points - 0.5), np.float64) + 0.5
-    seen = np.isfinite(found[..., 0] + found[..., 1])
-    return found if seen.all() else np.where(seen[..., None], found, np.nan)
+    moved = np.asarray(points_map(points - 0.5), np.float64) + 0.5
+    is_seen = np.isfinite(moved[..., 0] + moved[..., 1])
+    return moved if is_seen.all() else np.where(is_seen[..., None], moved, np.nan)

@@ -64,8 +64,8 @@ def carry(
     """
     table = table_of(boxes)
     # Reductions along a contiguous axis are several times as fast.
-    found = through(points_map, ellipses(table))
-    x, y = np.ascontiguousarray(np.moveaxis(found, -1, 0))
+    curves = through(points_map, ellipses(table))
+    x, y = np.ascontiguousarray(np.moveaxis(curves, -1, 0))
     carried = np.zeros((0, 4))
     if len(table):
         carried = np.stack((x.min(1), y.min(1), x.max(1), y.max(1)), 1)
@@ -75,9 +75,9 @@ def carry(
         whole &= (np.abs(np.diff(x, append=x[:, :1])) <= size[1] / 2).all(1)  # not at a seam
     turn = None
     if table.shape[1] == 5:
-        axes = (found - found[:, :1]).mT @ _CIRCLE  # of the affine map that is nearest
+        axes = (curves - curves[:, :1]).mT @ _CIRCLE  # of the affine map that is nearest
         turn = np.where(axes.any((1, 2)), angle_around(axes), table[:, 4])
-        x, y = np.moveaxis(found @ rotation(turn), -1, 0)
+        x, y = np.moveaxis(curves @ rotation(turn), -1, 0)
     if whole.any():
         frame = None if turn is None else turn[whole]
         carried[whole] = _ends(table[whole], points_map, x[whole], y[whole], frame)
@@ -118,11 +118,11 @@ def _ends(
     angle = 2 * np.pi / x.shape[1] * around
     middle, axes = frames_of(table)
     circle, (w, h) = _circle(angle), np.moveaxis(axes, -1, 0)[:, :, None]
-    found = through(points_map, middle[:, None] + circle[..., :1] * w + circle[..., 1:] * h)
+    points = through(points_map, middle[:, None] + circle[..., :1] * w + circle[..., 1:] * h)
     if turn is not None:
-        found = found @ rotation(turn)
-    x, y = np.moveaxis(np.where(np.isnan(found), np.inf, found), -1, 0)
-    x_high, y_high = np.moveaxis(np.where(np.isnan(found), -np.inf, found), -1, 0)
+        points = points @ rotation(turn)
+    x, y = np.moveaxis(np.where(np.isnan(points), np.inf, points), -1, 0)
+    x_high, y_high = np.moveaxis(np.where(np.isnan(points), -np.inf, points), -1, 0)
     return np.stack((_least(x[0]), _least(y[1]), -_least(-x_high[2]), -_least(-y_high[3])), 1)
 
 
@@ -158,8 +158,8 @@ def carry_polygon(polygon: Array, points_map: PointMap, step: float = _STEP) -> 
     Returns:
         The polygon (Q, 2) of the points that are seen; Q = 0 if none is.
     """
-    found = carry_points(cut_polygon(floats(polygon), step), points_map)
-    return like(polygon, found[~np.isnan(found[:, 0])])
+    moved = carry_points(cut_polygon(floats(polygon), step), points_map)
+    return like(polygon, moved[~np.isnan(moved[:, 0])])
 
 
 def cut_polygon(polygon: np.ndarray, step: float = _STEP) -> np.ndarray:

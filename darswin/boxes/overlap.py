@@ -48,10 +48,10 @@ def merge(
         if not 0 <= limit <= 1:
             raise ValueError(f"{name} must be in [0, 1], got {limit}")
     table, score, label = table_of(boxes), floats(scores), np.asarray(to_numpy(labels))
-    for name, given in (("scores", score), ("labels", label)):
-        if given.shape != (len(table),):
+    for name, values in (("scores", score), ("labels", label)):
+        if values.shape != (len(table),):
             raise ValueError(
-                f"{name} must have shape ({len(table)},), as the boxes, got {shape_of(given)}"
+                f"{name} must have shape ({len(table)},), as the boxes, got {shape_of(values)}"
             )
     order = np.argsort(-score, kind="stable")
     order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
@@ -59,10 +59,10 @@ def merge(
     area, kept = _area(table), np.ones(len(order), bool)
     x0, x1 = np.ascontiguousarray(upright(table)[:, ::2].T)
     for start in range(0, len(order), _ROWS):
-        one, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
-        meet = label[one] == label[rest]
-        meet &= x0[one] < x1[rest]
-        meet &= x1[one] > x0[rest]
+        rows, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
+        meet = label[rows] == label[rest]
+        meet &= x0[rows] < x1[rest]
+        meet &= x1[rows] > x0[rest]
         better, worse = np.nonzero(meet)
         ahead = better < worse
         better, worse = better[ahead] + start, worse[ahead] + start
@@ -72,8 +72,8 @@ def merge(
         better, worse = better[drops], worse[drops]  # sorted by the better one
         starts = np.flatnonzero(np.diff(better, prepend=-1))
         groups = np.split(worse, starts[1:])
-        for one, dropped in zip(better[starts].tolist(), groups, strict=False):
-            if kept[one]:
+        for best, dropped in zip(better[starts].tolist(), groups, strict=False):
+            if kept[best]:
                 kept[dropped] = False
     return like(boxes, order[kept])
 
@@ -89,9 +89,9 @@ def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.shape[-1] == 5:
         near = _common(upright(a), upright(b))
         meet = near > 0
-        one, other = (np.broadcast_to(table, (*meet.shape, 5))[meet] for table in (a, b))
+        first, second = (np.broadcast_to(table, (*meet.shape, 5))[meet] for table in (a, b))
         # No more than either, which it is but for rounding.
-        near[meet] = np.minimum(common_area(one, other), np.minimum(_area(one), _area(other)))
+        near[meet] = np.minimum(common_area(first, second), np.minimum(_area(first), _area(second)))
         return np.where(meet, near, 0)
     low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
     sides = np.maximum(high - low, 0)

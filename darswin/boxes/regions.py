@@ -90,74 +90,77 @@ def shown_parts(
     ends = np.cumsum([len(line) for line in lines])[:-1]
     new, shown = carry(np.concatenate(lines))
     parts: list[list[Part]] = [[] for _ in lines]
-    cut: list[_Cut] = []
-    for k, (line, there, seen) in enumerate(
+    cut: list[_Region] = []
+    for k, (line, there, is_shown) in enumerate(
         zip(lines, np.split(new, ends), np.split(shown, ends), strict=True)
     ):
-        if len(line) and seen.all():
+        if len(line) and is_shown.all():
             parts[k] = [Part(line, there)]
         elif len(line) and np.isfinite(line).all():
-            cut.append(_Cut(k, line, there, seen))
-    for one, found in zip(cut, _cut_parts(cut, carry), strict=True):
-        parts[one.number] = found
+            cut.append(_Region(k, line, there, is_shown))
+    for region, shown_of in zip(cut, _cut_parts(cut, carry), strict=True):
+        parts[region.number] = shown_of
     answers = []
-    for line, found, seen in zip(lines, parts, np.split(shown, ends), strict=True):
+    for line, shown_of, is_shown in zip(lines, parts, np.split(shown, ends), strict=True):
         if size is not None:
-            found = _in_one_place([_with_corners(part, size) for part in found], size[1])
+            shown_of = _in_one_place([_with_corners(part, size) for part in shown_of], size[1])
         whole = area_of(line)
         if whole > NO_AREA:
-            share = min(sum(area_of(part.old) for part in found) / whole, 1.0)
+            share = min(sum(area_of(part.old) for part in shown_of) / whole, 1.0)
         else:
-            share = float(seen.mean()) if len(found) else 0.0
-        answers.append((found, share))
+            share = float(is_shown.mean()) if len(shown_of) else 0.0
+        answers.append((shown_of, share))
     return answers
 
 
-class _Cut(NamedTuple):
+class _Region(NamedTuple):
     """A region of which a part is not shown."""
 
     number: int
     line: np.ndarray
     new: np.ndarray
-    seen: np.ndarray
+    is_shown: np.ndarray
 
 
 def _cut_parts(
-    cut: Sequence[_Cut], carry: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    cut: Sequence[_Region], carry: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> list[list[Part]]:
     """The parts of regions inside the rim. All rims are searched at once."""
     if not cut:
         return []
-    low = np.array([one.line.min(0) for one in cut])
-    sides = np.array([one.line.max(0) for one in cut]) - low
+    low = np.array([region.line.min(0) for region in cut])
+    sides = np.array([region.line.max(0) for region in cut]) - low
     grids = low[:, None] + _GRID * sides[:, None]
     on_grid = carry(grids.reshape(-1, 2))[1].reshape(len(cut), -1)
     rays = np.stack((np.cos(_TURN), np.sin(_TURN)), -1)
     middles: list[np.ndarray | None] = []
     inner: list[np.ndarray] = []
     outer: list[np.ndarray] = []
-    for one, grid, seen, side in zip(cut, grids, on_grid, sides, strict=True):
-        candidates = np.concatenate((grid[seen], one.line[one.seen]))
+    for region, grid, is_shown, side in zip(cut, grids, on_grid, sides, strict=True):
+        candidates = np.concatenate((grid[is_shown], region.line[region.is_shown]))
         if not len(candidates):
             middles.append(None)
             continue
-        gaps = candidates - (grid[seen] if seen.any() else candidates).mean(0)
+        gaps = candidates - (grid[is_shown] if is_shown.any() else candidates).mean(0)
         middle = candidates[np.argmin((gaps**2).sum(1))]
         middles.append(middle)
-        ahead = np.roll(one.line, -1, 0)
-        crosses = one.seen != np.roll(one.seen, -1)
-        starts = one.seen[crosses, None]
-        inner += [np.where(starts, one.line[crosses], ahead[crosses]), np.tile(middle, (_RAYS, 1))]
-        outer += [np.where(starts, ahead[crosses], one.line[crosses]),
+        ahead = np.roll(region.line, -1, 0)
+        crosses = region.is_shown != np.roll(region.is_shown, -1)
+        starts = region.is_shown[crosses, None]
+        inner += [
+            np.where(starts, region.line[crosses], ahead[crosses]),
+            np.tile(middle, (_RAYS, 1)),
+        ]
+        outer += [np.where(starts, ahead[crosses], region.line[crosses]),
                   middle + 1.01 * np.hypot(*side) * rays]  # fmt: skip
     if not inner:
         return [[] for _ in cut]
     lengths = np.cumsum([len(points) for points in inner])[:-1]
-    found = _last_shown(np.concatenate(inner), np.concatenate(outer), carry)
-    pieces = iter(zip(*(np.split(points, lengths) for points in found), strict=True))
+    ends = _last_shown(np.concatenate(inner), np.concatenate(outer), carry)
+    pieces = iter(zip(*(np.split(points, lengths) for points in ends), strict=True))
     return [
-        [] if middle is None else _walk(one, middle, Part(*next(pieces)), Part(*next(pieces)))
-        for one, middle in zip(cut, middles, strict=True)
+        [] if middle is None else _walk(region, middle, Part(*next(pieces)), Part(*next(pieces)))
+        for region, middle in zip(cut, middles, strict=True)
     ]
 
 
@@ -185,13 +188,13 @@ def _last_shown(
     return inner, new
 
 
-def _walk(one: _Cut, middle: np.ndarray, crossings: Part, rim: Part) -> list[Part]:
+def _walk(region: _Region, middle: np.ndarray, crossings: Part, rim: Part) -> list[Part]:
     """The parts of a region, along its outline and along the rim, both with increasing azimuth."""
-    places = np.flatnonzero(one.seen != np.roll(one.seen, -1))
+    places = np.flatnonzero(region.is_shown != np.roll(region.is_shown, -1))
     if not len(places):
-        return [rim] if contains(one.line, middle) else []
+        return [rim] if contains(region.line, middle) else []
     order = np.arange(len(places))
-    if one.seen[places[0]]:  # begins where the outline comes in
+    if region.is_shown[places[0]]:  # begins where the outline comes in
         order = np.roll(order, -1)
     entries, exits = order[::2], order[1::2]
     azimuth = np.arctan2(*(crossings.old - middle).T[::-1])
@@ -202,8 +205,8 @@ def _walk(one: _Cut, middle: np.ndarray, crossings: Part, rim: Part) -> list[Par
             todo.remove(k)
             first, last = places[entries[k]] + 1, places[exits[k]] + 1
             if last <= first:
-                last += len(one.line)
-            within = np.arange(first, last) % len(one.line)
+                last += len(region.line)
+            within = np.arange(first, last) % len(region.line)
             ahead = (azimuth[entries] - azimuth[exits[k]] + _SAME) % (2 * np.pi) - _SAME
             after = int(np.argmin(ahead))
             on_rim = (_TURN - azimuth[exits[k]]) % (2 * np.pi)
@@ -211,7 +214,7 @@ def _walk(one: _Cut, middle: np.ndarray, crossings: Part, rim: Part) -> list[Par
             chosen = chosen[np.argsort(on_rim[chosen])]
             pieces += [
                 Part(*(of[entries[k : k + 1]] for of in crossings)),
-                Part(one.line[within], one.new[within]),
+                Part(region.line[within], region.new[within]),
                 Part(*(of[exits[k : k + 1]] for of in crossings)),
                 Part(*(of[chosen] for of in rim)),
             ]

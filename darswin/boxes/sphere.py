@@ -51,13 +51,13 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     ray = np.nan_to_num(to_units(inner.reshape(len(table), 48, 2))).sum(1)
     cut = np.flatnonzero(np.isnan(rays).any((1, 2)))
     if len(cut):
-        found = [
+        outlines = [
             np.concatenate([np.zeros((0, 3)), *(part.new for part in parts)])
             for parts, _ in shown_parts([*ellipses(table[cut], FINELY)], to_units)
         ]
-        most = max(rays.shape[1], *map(len, found))
+        most = max(rays.shape[1], *map(len, outlines))
         rays = np.pad(rays, ((0, 0), (0, most - rays.shape[1]), (0, 0)), constant_values=np.nan)
-        for k, of_box in zip(cut, found, strict=True):
+        for k, of_box in zip(cut, outlines, strict=True):
             rays[k, : len(of_box)], rays[k, len(of_box) :] = of_box, np.nan
             if not ray[k].any():
                 ray[k] = of_box.sum(0)

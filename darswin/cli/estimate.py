@@ -44,22 +44,22 @@ def estimate(
         raise ValueError(f"no pictures in {', '.join(pictures)}")
     check_lens_out(out, files)
     check_out(report, files, "report")
-    found = estimate_lens(
+    estimated = estimate_lens(
         [read_stored(file) for file in files],
         model,
         center=center,
         fov=None if fov_deg is None else math.radians(fov_deg),
         progress=lambda line: print(line, file=sys.stderr),
     )
-    print(found.verdict)
-    for doubt in found.doubts:
+    print(estimated.verdict)
+    for doubt in estimated.doubts:
         print(f"doubt: {doubt}")
     if report is not None:
-        replace_file(report, json.dumps(found.to_dict() | {"pictures": files}, indent=1) + "\n")
-    if out is not None and not (found.is_sure or accept_doubts):
+        replace_file(report, json.dumps(estimated.to_dict() | {"pictures": files}, indent=1) + "\n")
+    if out is not None and not (estimated.is_sure or accept_doubts):
         raise ValueError(
             f"{out} is not written, because the pictures allow very different lenses: give more "
             "pictures, or --accept_doubts true"
         )
     if out is not None:
-        write_lens(found.lens, out, None)
+        write_lens(estimated.lens, out, None)

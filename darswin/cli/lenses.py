@@ -59,30 +59,30 @@ def lenses_of_run(
         raise ValueError(f"{missing}, because {run} was trained on pictures without a lens")
     try:
         if lens is not None:
-            found: Lenses = dict.fromkeys(files, Calibrations(lens, path, camera, coefficients))
+            lenses: Lenses = dict.fromkeys(files, Calibrations(lens, path, camera, coefficients))
         else:
             opening = {"camera": camera, "coefficients": coefficients}
             opening |= {option: data[option] for option in _OPENING if option in data}
-            found = _of_scenes(_scenes(path, TARGETS[task], opening), files)
+            lenses = _of_scenes(_scenes(path, TARGETS[task], opening), files)
         for file in files:
-            found[file].camera_of(file)
+            lenses[file].camera_of(file)
     except (ValueError, OSError) as error:
         raise ValueError(f"{missing}, because that of {run} cannot be used: {error}") from error
     what = f"lenses of the run's data set: {path}" if lens is None else f"lens of the run: {lens}"
     print(f"darswin: {what}", file=sys.stderr)
-    return found
+    return lenses
 
 
 def _scenes(path: str, target: Target, opening: Mapping[str, Any]) -> list[Scenes]:
     """The splits of a run's data set."""
-    found = []
+    splits = []
     for split in ("train", "val", "test"):
         try:
-            found.append(open_scenes(path, split, target, **opening))
+            splits.append(open_scenes(path, split, target, **opening))
         except FileNotFoundError:
             if split == "train":
                 raise
-    return found
+    return splits
 
 
 def _of_scenes(splits: Sequence[Scenes], files: Sequence[str]) -> Lenses:

@@ -58,25 +58,25 @@ def _list_of(content: Any) -> list[Any]:
 
 
 def _named(pairs: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    found: list[tuple[int, str]] = []
+    names: list[tuple[int, str]] = []
     for number, name in pairs:
         if isinstance(number, bool) or not re.fullmatch(r"\d{1,9}", str(number)):
             raise ValueError(f"{number!s:.60} is no number of a class")
         if not isinstance(name, str):
             raise ValueError(f"{name!s:.60} is no name of class {number}")
-        found.append((int(number), name))
-    if not found:
+        names.append((int(number), name))
+    if not names:
         raise ValueError("it has no names")
-    return mapping(found)
+    return mapping(names)
 
 
 def _label_map(text: str) -> dict[int, str]:
     """The names in a label map of TensorFlow; a name to show goes before an internal one."""
-    found = []
+    entries_of = []
     for item in _ITEM.findall(re.sub(r"(?m)^\s*#.*$", "", text)):
         entries = {key: a or b or c for key, a, b, c in _ENTRY.findall(item)}
         if "id" not in entries:
             raise ValueError(f"an item has no id: {' '.join(item.split()):.60}")
         name = entries.get("display_name") or entries.get("name")
-        found.append((entries["id"], name))
-    return _named(found)
+        entries_of.append((entries["id"], name))
+    return _named(entries_of)

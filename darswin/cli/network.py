@@ -87,7 +87,7 @@ class Boxes:
         )
 
 
-class Seen(NamedTuple):
+class BoundView(NamedTuple):
     """The view of the pictures of one camera."""
 
     remap: Remap
@@ -169,11 +169,11 @@ class NetworkAnswers(Answers):
     def _said(self, pixels: Pixels) -> str:
         """What is read of the file, and what it is given."""
         names = f", {len(self.network.names)} names of classes" if self.network.names else ""
-        given = "uint8"
+        values = "uint8"
         if self.network.output == "image":
             mean, std = (",".join(f"{v:.4g}" for v in part) for part in (pixels.mean, pixels.std))
-            given = f"(pixel/255 - mean) / std, mean {mean}, std {std}"
-        return f"detections ({self.network.form}{names}); pixels are {pixels.channels}, {given}"
+            values = f"(pixel/255 - mean) / std, mean {mean}, std {std}"
+        return f"detections ({self.network.form}{names}); pixels are {pixels.channels}, {values}"
 
     def _class_outputs(self) -> list[str]:
         """The outputs that are numbers of classes, if these were asked for."""
@@ -182,12 +182,12 @@ class NetworkAnswers(Answers):
             return []
         counts = {name: shape[0] for name, shape in network.shapes.items() if len(shape) == 1}
         wanted = None if self.labels is None else max(self.labels) + 1
-        found = [name for name, count in counts.items() if count == wanted or wanted is None]
-        if not found:
-            given = ", ".join(f"{count} in {name}" for name, count in counts.items())
+        outputs = [name for name, count in counts.items() if count == wanted or wanted is None]
+        if not outputs:
+            counted = ", ".join(f"{count} in {name}" for name, count in counts.items())
             text = f"`labels` names the classes 0 to {(wanted or 0) - 1}, but {network.path} gives"
-            raise naming(ValueError(f"{text} other numbers of classes: {given}"), "labels")
-        return found
+            raise naming(ValueError(f"{text} other numbers of classes: {counted}"), "labels")
+        return outputs
 
     def finish(self) -> str | None:
         return self._boxes.wrong(self.network.path)
@@ -200,23 +200,23 @@ class NetworkAnswers(Answers):
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         try:
-            seen: Seen = self._by_lens(lens, lambda: self._seen(image.shape[:2], lens))
+            bound: BoundView = self._by_lens(lens, lambda: self._bound_to(image.shape[:2], lens))
         except ValueError as error:
             raise BrokenImageError(f"{said(entry)} has no such view: {error}") from error
-        pictures = seen.sampler(image[..., :: self._step])
+        pictures = bound.sampler(image[..., :: self._step])
         start = time.perf_counter()
         try:
-            found = self.network(pictures)
+            outputs = self.network(pictures)
         except FloatingPointError as error:
             raise FloatingPointError(f"no prediction for {said(entry)}: {error}") from error
         self.seconds += time.perf_counter() - start
-        if isinstance(found, list):
-            answer = self._detections(entry, image, seen, found)
+        if isinstance(outputs, list):
+            answer = self._detections(entry, image, bound, outputs)
         else:
-            answer = self._outputs(entry, image, seen, found)
+            answer = self._outputs(entry, image, bound, outputs)
         self.found.append(entry | answer)
 
-    def _seen(self, size: tuple[int, int], lens: Lens) -> Seen:
+    def _bound_to(self, size: tuple[int, int], lens: Lens) -> BoundView:
         if isinstance(self.view, PlainView) and size != self.network.size:
             (height, width), (own_height, own_width) = size, self.network.size
             raise ValueError(
@@ -228,10 +228,10 @@ class NetworkAnswers(Answers):
         made = remap.plan(output, mean=self._mean, std=self._std)
         if (made.columns < -1).all():
             raise ValueError("it shows nothing of the picture: choose another, or check the lens")
-        return Seen(remap, Sampler(made))
+        return BoundView(remap, Sampler(made))
 
     def _detections(
-        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, tiles: list[Instances]
+        self, entry: dict[str, Any], image: np.ndarray, bound: BoundView, tiles: list[Instances]
     ) -> dict[str, Any]:
         """Writes and draws the detections of the view, or of all tiles, in the picture."""
         if self.network.overlaps:
@@ -240,13 +240,13 @@ class NetworkAnswers(Answers):
         if self._floor is not None:
             tiles = [
                 detections.with_columns(floor=tile.floor(detections.upright, **self._floor))
-                for tile, detections in zip(seen.remap.tiles, tiles, strict=True)
+                for tile, detections in zip(bound.remap.tiles, tiles, strict=True)
             ]
-        detections = in_picture(seen.remap, tiles)
+        detections = in_picture(bound.remap, tiles)
         if tiles[0].masks is not None:
             # One by one: those of all instances could fill the memory.
             masks = [
-                encode_rle(seen.remap.tiles[tile].back(tiles[tile].masks[row, None])[0] > 0.5)
+                encode_rle(bound.remap.tiles[tile].back(tiles[tile].masks[row, None])[0] > 0.5)
                 for tile, row in detections.more["source"].tolist()
             ]
             detections = replace(detections, masks=masks)
@@ -260,7 +260,7 @@ class NetworkAnswers(Answers):
         scores = zip(names, detections.scores, strict=True)
         texts = [f"{name} {score:.2f}" for name, score in scores]
         picture = write_overlay(self._out, name, draw_instances(image, detections, texts))
-        return {"overlay": picture, "detections": _entries(detections, names, seen.remap)}
+        return {"overlay": picture, "detections": _entries(detections, names, bound.remap)}
 
     def flush(self) -> None:
         if self._format == "coco":
@@ -277,11 +277,15 @@ class NetworkAnswers(Answers):
         return self.labels[label]
 
     def _outputs(
-        self, entry: dict[str, Any], image: np.ndarray, seen: Seen, found: dict[str, np.ndarray]
+        self,
+        entry: dict[str, Any],
+        image: np.ndarray,
+        bound: BoundView,
+        outputs: dict[str, np.ndarray],
     ) -> dict[str, Any]:
         """Writes maps at the size of the picture; numbers are part of the answer."""
         answer: dict[str, Any] = {}
-        for output, values in found.items():
+        for output, values in outputs.items():
             if values.ndim < 4:
                 each = [self._best(v) if output in self._classes else v.tolist() for v in values]
                 answer[output] = each[0] if len(each) == 1 else each
@@ -290,7 +294,7 @@ class NetworkAnswers(Answers):
             name = f"{folder}/{file_of(entry, self._names)}"
             is_ids = values.dtype.kind in "biu"  # of classes or things
             maps = torch.from_numpy(values.astype(np.int64 if is_ids else np.float32))
-            planes = seen.remap.back(maps)[0].numpy()
+            planes = bound.remap.back(maps)[0].numpy()
             content = io.BytesIO()
             np.save(content, planes)
             replace_file(self._out / f"maps/{name}.npy", content.getbuffer())
@@ -300,7 +304,7 @@ class NetworkAnswers(Answers):
                 continue
             if labels.min() < 0 or labels.max() > IGNORE:
                 continue  # ids of things
-            labels = np.where(seen.remap.shown, labels, IGNORE)
+            labels = np.where(bound.remap.shown, labels, IGNORE)
             colors = palette(IGNORE if is_ids else len(planes))
             answer[output] |= self._labels(name, image, labels.astype(np.uint8), colors)
         return answer

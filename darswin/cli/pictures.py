@@ -175,8 +175,8 @@ def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> d
     paths = [path for path in paths if not is_stream(path)] or ["."]
     folders = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
     root = os.path.commonpath(folders)
-    found = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
-    return found | {name: re.sub(r"\W+", "_", name) for name in streams}
+    relative = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+    return relative | {name: re.sub(r"\W+", "_", name) for name in streams}
 
 
 def claim_folder(out: str | None, record: str) -> Path:

@@ -129,9 +129,9 @@ def predict(
         "channels": channels, "threshold": threshold, "labels": labels, "scores": scores,
         "height": height, "radius": radius, "format": format,
     }  # fmt: skip
-    if network is None and (given := [k for k, value in options.items() if value is not None]):
-        raise ValueError(f"--{given[0]} is an option of --network, an ONNX file")
-    if sum(given is not None for given in (run, model, network)) != 1:
+    if network is None and (typed := [k for k, value in options.items() if value is not None]):
+        raise ValueError(f"--{typed[0]} is an option of --network, an ONNX file")
+    if sum(weights is not None for weights in (run, model, network)) != 1:
         raise ValueError(
             "give either --run, the folder of a run, or --model, a safetensors file or one of "
             + ", ".join(list_pretrained())
@@ -190,17 +190,17 @@ def predict(
         try:
             answers.flush()
         finally:
-            found = answers.found
-            if found:
-                text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
+            entries = answers.found
+            if entries:
+                text = json.dumps(entries, indent=1, ensure_ascii=False, allow_nan=False)
                 print(text) if out is None else replace_file(out, text)
     if (wrong := answers.finish()) is not None:
         raise ValueError("\n".join([wrong, *broken.errors]))
     videos = any(file.is_video for file in files)
     what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
     count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
-    broken.report(count if found else "")
-    return found
+    broken.report(count if entries else "")
+    return entries
 
 
 def _of_model(

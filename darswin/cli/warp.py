@@ -112,12 +112,12 @@ def warp(
     folder = _claim(out, settings)
     work = _Work(replace(data, files=(), raw=(), entries=()), view,
                  folder if in_yolo else folder / PICTURES)  # fmt: skip
-    found: list[_Warped] = []
+    warped: list[_Warped] = []
     with Progress("warp", len(data)) as progress, _pool(work, processes) as each:
-        for one in each(data.files, data.raw):
-            found.append(one)
+        for new in each(data.files, data.raw):
+            warped.append(new)
             progress.done += 1
-    _write(folder, data, view, found, settings | {"yolo": source if in_yolo else None})
+    _write(folder, data, view, warped, settings | {"yolo": source if in_yolo else None})
 
 
 class _Warped(NamedTuple):
@@ -136,9 +136,9 @@ class _Maps:
     """What pictures of one lens become: pictures of another camera, or of a view."""
 
     def __init__(self, lens: Lens, view: PixelView):
-        seen = to_corners(lens)
-        self.remap = view.at(seen, picture_size(lens))
-        self.said = json.dumps(to_dict(seen))
+        camera = to_corners(lens)
+        self.remap = view.at(camera, picture_size(lens))
+        self.said = json.dumps(to_dict(camera))
 
     def pictures(self, image: np.ndarray) -> np.ndarray:
         return self.remap(image).reshape(len(self.remap.tiles), *self.remap.view_size, -1)
@@ -278,20 +278,20 @@ def _claim(out: str, settings: dict[str, Any]) -> Path:
 
 
 def _write(
-    folder: Path, data: LabelledPictures, view: PixelView, found: Sequence[_Warped],
+    folder: Path, data: LabelledPictures, view: PixelView, warped: Sequence[_Warped],
     settings: Mapping[str, Any],
 ) -> None:  # fmt: skip
     """Writes the labels, the new camera or view, and the report, and prints it."""
     entries = data.entries or [{}] * len(data)
     pictures = [
-        ({**entry, "file_name": file} | ({"source": name} if len(one.pictures) > 1 else {}), labels)
-        for name, entry, one in zip(data.files, entries, found, strict=True)
-        for file, labels in one.pictures
+        ({**entry, "file_name": file} | ({"source": name} if len(new.pictures) > 1 else {}), labels)
+        for name, entry, new in zip(data.files, entries, warped, strict=True)
+        for file, labels in new.pictures
     ]
     if settings["yolo"] is not None:
         new_names = {
-            os.path.normpath(name): [file for file, _ in one.pictures]
-            for name, one in zip(data.files, found, strict=True)
+            os.path.normpath(name): [file for file, _ in new.pictures]
+            for name, new in zip(data.files, warped, strict=True)
         }
         said, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
         write_yolo(folder, pictures, data.categories, said)
@@ -302,7 +302,7 @@ def _write(
     if isinstance(view, CameraView):
         save(view.lens, folder / LENS)
     else:
-        lenses = [json.loads(said) for said in dict.fromkeys(one.lens for one in found) if said]
+        lenses = [json.loads(said) for said in dict.fromkeys(new.lens for new in warped) if said]
         options = {name: settings[name] for name in ("fov_deg", "up")}
         record = {"view": settings["to"], "size": view.size} | options | {"lenses": lenses}
         replace_file(folder / VIEW, json.dumps(record, indent=1))
@@ -313,14 +313,14 @@ def _write(
             "visible": round(float(shares.max()), 3),
             "fits_no_tile": bool(shares.sum() >= LEAST_VISIBLE),
         }
-        for name, one in zip(data.files, found, strict=True) if len(one.left)
+        for name, new in zip(data.files, warped, strict=True) if len(new.left)
         for entry, label, shares in zip(
-            one.left.more["entry"], one.left.labels.tolist(), one.left.more["shares"], strict=True
+            new.left.more["entry"], new.left.labels.tolist(), new.left.more["shares"], strict=True
         )
     ]  # fmt: skip
     replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
-    bad = [one.error for one in found if one.error]
-    wrong = [*data.wrong, *(text for one in found for text in one.wrong)]
+    bad = [new.error for new in warped if new.error]
+    wrong = [*data.wrong, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)

@@ -102,14 +102,14 @@ class LensAdapter(Model[Any]):
             results = self.boxes(results)
         if self.output == "view":
             return results
-        found = find_detections(results)
-        if found is not None:
-            if len(found) != len(x):
+        detections = find_detections(results)
+        if detections is not None:
+            if len(detections) != len(x):
                 raise ValueError(
                     f"the network must give detections for each of its {len(x)} pictures, got "
-                    f"{len(found)} results"
+                    f"{len(detections)} results"
                 )
-            return detections_to_images(found, self.view, prepared)
+            return detections_to_images(detections, self.view, prepared)
         if self.boxes is not None and len(x):
             raise TypeError(
                 "boxes must return a dict of tensors boxes, scores and labels, or a list of them, "

@@ -98,10 +98,10 @@ class Remap:
         no ray lands, or it ends. ValueError for points of another shape."""
 
         def move(pixels: Tensor) -> Tensor:
-            found = self._one.to_image(pixels, self.lens, self.size)
-            sides = tensor_there(self.size[::-1], found)
-            beyond = (found + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
-            return torch.where(beyond.any(-1, keepdim=True), torch.nan, found)
+            points = self._one.to_image(pixels, self.lens, self.size)
+            sides = tensor_there(self.size[::-1], points)
+            beyond = (points + 0.5 - sides / 2).abs() > sides / 2 + _ROUNDING
+            return torch.where(beyond.any(-1, keepdim=True), torch.nan, points)
 
         return self._moved(points, move)
 
@@ -169,9 +169,9 @@ class Remap:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):
             raise ValueError(f"points must have shape (..., 2), got {shape}")
         if not isinstance(points, Tensor):
-            given = np.asarray(points)
-            moved = move(as_tensor(given, torch.float64)[None])[0]
-            return moved.numpy().astype(np.result_type(given, np.float32), copy=False)
+            array = np.asarray(points)
+            moved = move(as_tensor(array, torch.float64)[None])[0]
+            return moved.numpy().astype(np.result_type(array, np.float32), copy=False)
         moved = move(points[None].to("cpu", torch.float64))[0]
         return moved.to(points.device, torch.promote_types(points.dtype, torch.float32))
 

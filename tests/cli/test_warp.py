@@ -201,7 +201,7 @@ def test_woodscape_becomes_tiles():
     root = write_woodscape(Path("woodscape"), 4)
     data = read_coco(warp(root, "tiles:5", "--size 96,96", lens=None))
     assert len(data) == 20 and {c["name"] for c in data.categories} == {"vehicles"}
-    assert any(data.labels(k).things for k in range(20))
+    assert any(len(data.labels(k).instances) for k in range(20))
     assert len(json.loads(Path("out/view.json").read_text())["lenses"]) > 1  # four cameras
 
 
@@ -211,8 +211,8 @@ def test_yolo_stays_yolo(flat):
     data = read_coco(flat)
     for k, name in enumerate(data.files):
         lines = [
-            " ".join([str(t.category - 1), *map(str, (t.polygons[0] / SIZE[::-1]).ravel())])
-            for t in data.labels(k).things if len(t.polygons)
+            " ".join([str(t.labels[0] - 1), *map(str, (t.outlines[0][0] / SIZE[::-1]).ravel())])
+            for t in data.labels(k).instances if len(t.outlines[0])
         ]  # fmt: skip
         Path("yolo/labels", name).with_suffix(".txt").write_text("\n".join(lines))
     Path("yolo/data.yaml").write_text(yaml.safe_dump({"names": ["a", "b", "c"]}))
@@ -221,10 +221,10 @@ def test_yolo_stays_yolo(flat):
     assert list(found.files) == [f"images/{name}" for name in by_coco.files]
     assert found.lenses is not None and not Path("out/annotations.json").exists()
     for k in range(3):
-        (mine,) = found.labels(k).things
-        (same,) = (t for t in by_coco.labels(k).things if len(t.polygons))
-        np.testing.assert_allclose(mine.polygons[0], same.polygons[0], atol=2e-3)
-        assert mine.category == same.category - 1
+        (mine,) = found.labels(k).instances
+        (same,) = (t for t in by_coco.labels(k).instances if len(t.outlines[0]))
+        np.testing.assert_allclose(mine.outlines[0], same.outlines[0], atol=2e-3)
+        assert mine.labels == same.labels - 1
 
 
 def test_things_that_leave_are_reported(flat, capsys):
