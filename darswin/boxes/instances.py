@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from darswin.boxes.arrays import PointMap
+from darswin.boxes.arrays import PointMap, table_of
 from darswin.boxes.carried import carry, carry_points, cut_polygon
 from darswin.boxes.overlap import clip, merge
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask, shown_parts
@@ -39,6 +39,10 @@ class Instances:
         outlines: of each, the parts of its outline, polygons (P, 2); none if it is not known.
         more: other columns by their names, such as "visible" (K,), the share of an instance that
             its picture shows, 0 to 1. Each is an array or a list.
+
+    Raises:
+        TypeError: the boxes are no array.
+        ValueError: boxes of another shape, or a column of another length.
     """
 
     boxes: np.ndarray
@@ -49,6 +53,14 @@ class Instances:
     outlines: Column = None
     more: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.boxes, np.ndarray):
+            raise TypeError(f"boxes must be an array, got {type(self.boxes).__name__}")
+        count = len(table_of(self.boxes))
+        for name, column in (*self._columns(), *self.more.items()):
+            if column is not None and len(column) != count:
+                raise ValueError(f"{name} must have {count} rows, as the boxes, got {len(column)}")
+
     def __len__(self) -> int:
         return len(self.boxes)
 
@@ -56,9 +68,9 @@ class Instances:
         number = np.atleast_1d(np.arange(len(self))[rows])
 
         def taken(column: Any) -> Any:
-            if column is None or isinstance(column, np.ndarray):
-                return None if column is None else column[number]
-            return [column[k] for k in number.tolist()]
+            if isinstance(column, np.ndarray):
+                return column[number]
+            return None if column is None else [column[k] for k in number.tolist()]
 
         columns = {name: taken(column) for name, column in self._columns()}
         more = {name: taken(column) for name, column in self.more.items()}
@@ -73,7 +85,11 @@ class Instances:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The instances of all parts, one after another. Of `more`, the columns that all have."""
+        """The instances of all parts, one after another. Of `more`, the columns that all have.
+
+        Raises:
+            ValueError: some parts have scores or labels, and others have none.
+        """
         if not parts:
             return cls(np.zeros((0, 4)), labels=np.zeros(0, int))
         columns = {name: [getattr(part, name) for part in parts] for name, _ in parts[0]._columns()}
@@ -85,6 +101,9 @@ class Instances:
             if any(column is not None for column in columns[name]):
                 each = zip(columns[name], parts, strict=True)
                 columns[name] = [[unknown] * len(p) if c is None else c for c, p in each]
+        for name in ("scores", "labels"):
+            if 0 < sum(column is None for column in columns[name]) < len(parts):
+                raise ValueError(f"either all parts or none must have {name}")
         names = [name for name in parts[0].more if all(name in part.more for part in parts)]
         more = {name: _concatenated([part.more[name] for part in parts]) for name in names}
         return cls(**{name: _concatenated(of) for name, of in columns.items()}, more=more)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -57,3 +58,16 @@ def test_rows_are_chosen_as_those_of_an_array():
     assert [instance.labels.item() for instance in all_three] == [0, 1, 2]
     with pytest.raises(IndexError):
         all_three[3]
+
+
+def test_columns_that_do_not_fit_are_named():
+    for error, said, columns in (
+        (TypeError, "boxes must be an array, got list", dict(boxes=[[0, 0, 1, 1]])),
+        (ValueError, r"boxes must have shape \(K, 4\)", dict(boxes=np.zeros((2, 3)))),
+        (ValueError, "scores must have 2 rows, as the boxes, got 1", dict(scores=np.ones(1))),
+        (ValueError, "masks must have 2 rows, as the boxes, got 3", dict(masks=[None] * 3)),
+        (ValueError, "name must have 2 rows, as the boxes, got 0", dict(more={"name": []})),
+    ):
+        refused(said, lambda c=columns: Instances(**{"boxes": np.zeros((2, 4))} | c), error=error)
+    parts = instances_of(1, 4, None, False, False), Instances(np.zeros((1, 4)))
+    refused("either all parts or none must have scores", Instances.joined, parts)
