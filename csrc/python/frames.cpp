@@ -5,6 +5,7 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <cctype>
 #include <cerrno>
 #include <memory>
 #include <optional>
@@ -158,18 +159,36 @@ py::object run_network(const FrameNetwork& network, const py::object& given, con
   return out.is_none() ? results : out;
 }
 
-// Returns a function that runs the network of a file, and what the file says of it: the size of the
-// frames, the shapes of the outputs, and the labels.
-py::tuple open_network(const std::string& path) {
-  std::shared_ptr<const FrameNetwork> network;
+// Opens a file. What the system cannot read is an OSError.
+template <typename File>
+std::shared_ptr<const File> opened(const std::string& path) {
   try {
     const py::gil_scoped_release free;
-    network = std::make_shared<const FrameNetwork>(path);
+    return std::make_shared<const File>(path);
   } catch (const std::system_error& error) {
     errno = error.code().value();
     PyErr_SetFromErrnoWithFilename(PyExc_OSError, path.c_str());
     throw py::error_already_set();
   }
+}
+
+// Returns the arrays and the texts of a file.
+py::tuple read_tensors(const std::string& path) {
+  const auto file = opened<TensorFile>(path);
+  py::dict arrays;
+  for (const auto& [name, tensor] : file->tensors) {
+    // NumPy's "i4" is "I32" here.
+    const std::string bytes = std::to_string(std::stoi(tensor.type.substr(1)) / 8);
+    const py::dtype kind(static_cast<char>(std::tolower(tensor.type[0])) + bytes);
+    arrays[py::str(name)] = py::array(kind, tensor.shape, tensor.data);  // a copy
+  }
+  return py::make_tuple(arrays, file->texts);
+}
+
+// Returns a function that runs the network of a file, and what the file says of it: the size of the
+// frames, the shapes of the outputs, and the labels.
+py::tuple open_network(const std::string& path) {
+  const auto network = opened<FrameNetwork>(path);
   const py::cpp_function run(
       [network](const py::object& frame, const py::object& out, int64_t threads) {
         return run_network(*network, frame, out, threads);
@@ -339,6 +358,7 @@ PYBIND11_MODULE(_frames, m) {
         py::name("sample"), py::arg("frame"), py::arg("out") = py::none(), py::arg("threads") = 1);
   });
   m.def("network", &open_network);
+  m.def("read_tensors", &read_tensors);
   m.def("polar_places", &polar_places);
   m.def("read", &read<uint8_t>, py::arg().noconvert(), py::arg(), py::arg(), py::arg());
   m.def("read", &read<float>, py::arg().noconvert(), py::arg(), py::arg(), py::arg());

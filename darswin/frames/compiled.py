@@ -50,6 +50,10 @@ class Frames(Protocol):
         outputs, and its labels."""
 
     @staticmethod
+    def read_tensors(path: bytes, /) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """The arrays and the texts of a file."""
+
+    @staticmethod
     def polar_places(
         radii: np.ndarray,
         azimuths: np.ndarray,
