@@ -34,8 +34,8 @@ _WRONG, _RIGHT = (213, 0, 50), (222, 222, 222)
 # Okabe and Ito's colours without black.
 _FIRST = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233),
           (213, 94, 0), (240, 228, 66))  # fmt: skip
-# Those after them, a digit for each of r, g and b: of all such colours, each differs most from those
-# before it, also for people who cannot see red or green.
+# Those after them, a digit for each of r, g and b. Of all such colours, each differs most from
+# those before it, also for people who do not see red or green.
 _MORE = (
     "00fbfa004430109eff76f5356b61385da763644ff869fbdf00243d34b321ffd068dc66dc3bc225d74ff2006b18740"
     "17d423c1ad34e0629d8d84b99c300bde65c8c025fbff6be882238b709f860269cf72f95510321230d5cc9068ec25d"
