@@ -11,8 +11,6 @@ namespace darswin {
 struct ElementKernels {
   // Adds x to `to`, n numbers each.
   void (*add)(const float* x, float* to, int64_t n);
-  // Adds the products of the numbers of x and y to `to`, n numbers each.
-  void (*add_products)(const float* x, const float* y, float* to, int64_t n);
   // Replaces n numbers by their GELU, or their ReLU.
   void (*gelu)(float* x, int64_t n);
   void (*relu)(float* x, int64_t n);

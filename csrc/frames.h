@@ -61,4 +61,21 @@ struct FrameKernels {
   void (*sample)(const FrameArgs& args, int64_t begin, int64_t end);
 };
 
+// A picture (H, W, C) of uint8_t or float that is read at points of float, 0 outside.
+template <typename T>
+struct ReadArgs {
+  const T* picture;
+  int64_t height, width, channels;  // at most 2^24, and not 0
+  const float* points;              // x and y, (k rows, k columns, 2)
+  int64_t columns, reads;           // of `to`, and k
+  T* to;                            // (rows, columns, C): each is the mean of k² points
+};
+
+template <typename T>
+struct ReadKernels {
+  void (*any)(const ReadArgs<T>& args, int64_t rows);  // of any number of channels
+  void (*three)(const ReadArgs<T>& args, int64_t rows);
+  void (*four)(const ReadArgs<T>& args, int64_t rows);
+};
+
 }  // namespace darswin

@@ -18,7 +18,6 @@ struct WindowAttentionArgs {
   const T* qkv;      // (B, R, A, 3, heads, d)
   const Real* bias;  // (B or 1, heads, 2 M_r - 1, 2 M_a - 1)
   int64_t bias_rows, windows;
-  bool dense = false;  // the bias is (B or 1, heads, keys, queries) instead; forward alone takes it
   int64_t rings, sectors, heads, head_dim;
   int64_t window_r, window_a, shift_r, shift_a;
   bool periodic_r, periodic_a;

@@ -126,18 +126,12 @@ struct Parts {
     const auto floats = [&](int64_t width) {
       return round_up(tokens * width * sizeof(float) + kSpare, 64);
     };
-    normed = floats(block.norm1.dim), qkv = floats(block.attention_width());
+    normed = floats(block.norm1.dim), qkv = floats(block.qkv.columns);
     hidden = floats(block.fc1.columns);
   }
 };
 
 }  // namespace
-
-int64_t Block::attention_width() const {
-  const int64_t dim = norm1.dim, groups = deformable.groups;
-  if (groups == 0) return 3 * dim;
-  return 7 * dim + 2 * groups + windows.heads * windows.rings * windows.sectors;
-}
 
 int64_t Block::scratch(int64_t tokens) const {
   const Parts parts(*this, tokens);
@@ -151,16 +145,10 @@ void Block::run(float* x, int64_t batch, const float* table, int64_t table_rows,
   auto* normed = static_cast<char*>(scratch);
   char *keys = normed + parts.normed, *hidden = keys + parts.qkv;
   normalize(x, rows, norm1, normed, &qkv);
+  multiply(normed, rows, qkv, keys);
   WindowAttentionArgs<float> args = windows;
   args.qkv = reinterpret_cast<const float*>(keys);
-  if (deformable.groups > 0) {
-    args.bias = deform(reinterpret_cast<const float*>(normed), batch, table, table_rows,
-                       reinterpret_cast<float*>(keys));
-    args.bias_rows = batch, args.dense = true;
-  } else {
-    multiply(normed, rows, qkv, keys);
-    args.bias = table, args.bias_rows = table_rows;
-  }
+  args.bias = table, args.bias_rows = table_rows;
   args.windows *= batch;
   attend(args, normed, proj);
   multiply(normed, rows, proj, x, After::add);

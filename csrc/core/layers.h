@@ -45,37 +45,17 @@ void normalize(const float* x, int64_t rows, const Norm& norm, void* out,
 // Runs window attention; its result is what the layer `next` reads.
 void attend(WindowAttentionArgs<float> args, void* out, const Layer& next);
 
-// What deformable attention has besides the parts of a block: a small network, which moves the
-// points where keys and values are sampled, and the layer of these.
-struct Deformable {
-  int64_t groups = 0;             // of heads that share their points; 0 without this attention
-  int64_t kernel = 0;             // the odd side of the depthwise convolution
-  float reach = 0;                // the largest offset of a point, in half tokens
-  const float* around = nullptr;  // the convolution: its weight (kernel, kernel, D), then its bias
-  Norm norm;
-  Layer offset, kv;
-};
-
 // A transformer block on maps (batch, R, A, D). It changes the maps in place.
 struct Block {
   Norm norm1, norm2;
-  Layer qkv, proj, fc1, fc2;             // with deformable attention, qkv gives queries alone
+  Layer qkv, proj, fc1, fc2;
   WindowAttentionArgs<float> windows{};  // of one image, without pointers
-  Deformable deformable{};
 
-  // The numbers of working memory for each token, in attention.
-  int64_t attention_width() const;
   // The bytes of working memory for so many tokens.
   int64_t scratch(int64_t tokens) const;
   // `table` is the position bias (table_rows, heads, 2 M_r - 1, 2 M_a - 1), with a row for each
   // image or one for all.
   void run(float* x, int64_t batch, const float* table, int64_t table_rows, void* scratch) const;
-
- private:
-  // Writes the queries, keys and values of tokens x to `qkv`, and the biases of all pairs of tokens
-  // (batch, heads, keys, queries) to memory behind them, which it returns.
-  const float* deform(const float* x, int64_t batch, const float* table, int64_t table_rows,
-                      float* qkv) const;
 };
 
 }  // namespace darswin

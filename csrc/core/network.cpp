@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <array>
-#include <bit>
 #include <cmath>
 #include <stdexcept>
 #include <string>
@@ -15,7 +14,7 @@ namespace darswin {
 namespace {
 
 // The count of arguments of each opcode, in its order.
-constexpr std::array<int64_t, 14> kArguments = {9, 5, 23, 19, 2, 4, 2, 8, 7, 8, 8, 2, 5, 30};
+constexpr std::array<int64_t, 13> kArguments = {9, 5, 23, 19, 2, 4, 2, 8, 7, 8, 8, 2, 5};
 constexpr char kTooLarge[] = "wants more memory than its inputs and layers can need";
 
 void require(bool condition, const char* what) {
@@ -119,9 +118,9 @@ void Network::check_memory() {
   for (const int64_t numbers : buffers) require((wanted += numbers) <= most, kTooLarge);
   total += wanted;
   for (const Step& step : steps) {
-    if (!step.is_block()) continue;
+    if (step.opcode != Opcode::block) continue;
     const WindowAttentionArgs<float>& map = step.block.windows;
-    const int64_t widest = std::max(step.block.attention_width(), step.block.fc1.columns);
+    const int64_t widest = std::max(step.block.qkv.columns, step.block.fc1.columns);
     require(product({map.rings, map.sectors, widest}) <= most, kTooLarge);
   }
 }
@@ -156,20 +155,7 @@ Norm Network::norm_at(int64_t offset, int64_t dim) const {
   return {parameters, dim, parameters[2 * dim]};
 }
 
-Deformable Network::deformable_of(const int64_t* a, int64_t dim, int64_t heads) const {
-  const int64_t groups = a[0], kernel = a[1];
-  require(groups > 0 && heads % groups == 0 && kernel > 0 && kernel % 2 == 1,
-          "has a block of wrong sizes");
-  return {.groups = groups,
-          .kernel = kernel,
-          .reach = std::bit_cast<float>(static_cast<int32_t>(a[2])),
-          .around = weights_at(a[3], product({kernel, kernel, dim}) + dim),
-          .norm = norm_at(a[4], dim / groups),
-          .offset = layer_at(a[5], dim / groups, 2, 0),
-          .kv = layer_at(a[6], dim, 2 * dim, 0)};
-}
-
-Block Network::block_of(const int64_t* a, bool deforms) const {
+Block Network::block_of(const int64_t* a) const {
   const int64_t rings = a[1], sectors = a[2], dim = a[3], heads = a[4], mlp = a[5];
   fits(a[0], {rings, sectors, dim}, true);
   require(heads > 0 && dim > 0 && dim % heads == 0 && mlp > 0, "has a block of wrong sizes");
@@ -183,18 +169,12 @@ Block Network::block_of(const int64_t* a, bool deforms) const {
   }
   require(a[22] < input_count(), "has a table that is no input");
   fits(a[22], {heads, 2 * w[0] - 1, 2 * w[1] - 1}, false);
-  require(!deforms || (w[0] == rings && w[1] == sectors && w[2] == 0 && w[3] == 0 && a[8] == 0),
-          "has deformable attention that does not fit its map");
   Block block{.norm1 = norm_at(a[6], dim),
               .norm2 = norm_at(a[11], dim),
-              .qkv = layer_at(a[7], dim, deforms ? dim : 3 * dim, a[8]),
+              .qkv = layer_at(a[7], dim, 3 * dim, a[8]),
               .proj = layer_at(a[9], dim, dim, a[10]),
               .fc1 = layer_at(a[12], dim, mlp, a[13]),
               .fc2 = layer_at(a[14], mlp, dim, a[15])};
-  if (deforms) {
-    product({rings, sectors, rings, sectors, heads});
-    block.deformable = deformable_of(a + 23, dim, heads);
-  }
   auto& windows = block.windows;
   windows.rings = rings, windows.sectors = sectors;
   windows.heads = heads, windows.head_dim = dim / heads;
@@ -244,8 +224,7 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       step.norm = norm_at(a[4], a[3]);
       break;
     case Opcode::block:
-    case Opcode::deform:
-      step.block = block_of(a, opcode == Opcode::deform);
+      step.block = block_of(a);
       break;
     case Opcode::copy: {
       apart();

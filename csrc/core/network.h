@@ -33,8 +33,6 @@ enum class Opcode : int64_t {
   to_image,  // x, out, R, A, channels, H, W, plan: polar_to_image
   distance,  // x, in place, typical distance as the bits of a float
   pool,      // x, out, H, W, channels: the largest of 2 x 2 pixels, also of fewer at the ends
-  deform,    // as block, with queries for qkv, in float, and one window; then groups, kernel,
-             // reach as the bits of a float, convolution, norm, offset, kv (see Deformable)
 };
 
 constexpr int64_t kCopyAxes = 5;
@@ -82,8 +80,6 @@ class Network {
     // A convolution applies a function, adds this slot, if any, and applies a function to the sum.
     After after = After::nothing, then = After::nothing;
     int64_t summand = -1;
-
-    bool is_block() const { return opcode == Opcode::block || opcode == Opcode::deform; }
   };
   struct Run;
 
@@ -92,8 +88,7 @@ class Network {
   Layer layer_at(int64_t offset, int64_t depth, int64_t columns, int64_t is_quantized) const;
   Norm norm_at(int64_t offset, int64_t dim) const;
   const float* weights_at(int64_t offset, int64_t count) const;
-  Block block_of(const int64_t* arguments, bool deforms) const;
-  Deformable deformable_of(const int64_t* arguments, int64_t dim, int64_t heads) const;
+  Block block_of(const int64_t* arguments) const;
   void fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const;
   void check_memory();
 

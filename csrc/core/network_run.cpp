@@ -11,7 +11,6 @@
 #include "dispatch.h"
 #include "network.h"
 #include "parallel.h"
-#include "sampling.h"
 #include "to_image.h"
 
 namespace darswin {
@@ -41,6 +40,30 @@ Between between(int64_t k, int64_t size, int64_t from) {
       std::max((static_cast<float>(k) + 0.5f) * (static_cast<float>(from) / size) - 0.5f, 0.0f);
   const auto first = std::min(static_cast<int64_t>(place), from - 1);
   return {first, std::min(first + 1, from - 1), place - static_cast<float>(first)};
+}
+
+// Writes the channels of a map (height, width, channels) at a pixel (x, y), 0 outside.
+void sample_at(const float* map, int64_t height, int64_t width, int64_t channels, float x, float y,
+               float* out) {
+  // NaN is outside too.
+  if (!(x > -1 && x < static_cast<float>(width) && y > -1 && y < static_cast<float>(height))) {
+    std::fill_n(out, channels, 0.0f);
+    return;
+  }
+  const float left = std::floor(x), top = std::floor(y);
+  const float right_part = x - left, lower_part = y - top;
+  const auto column = static_cast<int64_t>(left), row = static_cast<int64_t>(top);
+  const float* corners[4];
+  float parts[4];
+  for (int64_t corner = 0; corner < 4; ++corner) {
+    const int64_t i = row + corner / 2, j = column + corner % 2;
+    const bool inside = i >= 0 && i < height && j >= 0 && j < width;
+    corners[corner] = map + (inside ? (i * width + j) * channels : 0);
+    parts[corner] = inside ? (corner / 2 == 1 ? lower_part : 1 - lower_part) *
+                                 (corner % 2 == 1 ? right_part : 1 - right_part)
+                           : 0;
+  }
+  kernels<ElementKernels>().mix(corners, parts, out, channels);
 }
 
 }  // namespace
@@ -99,7 +122,7 @@ struct Network::Run {
   int64_t part(const Step& step) const {
     const auto& block = step.block;
     const int64_t tokens = block.windows.rings * block.windows.sectors;
-    const int64_t widest = std::max(block.attention_width(), block.fc1.columns);
+    const int64_t widest = std::max(block.qkv.columns, block.fc1.columns);
     const int64_t bytes = tokens * widest * static_cast<int64_t>(sizeof(float));
     return std::clamp<int64_t>(kPartBytes / bytes, 1, batch);
   }
@@ -108,7 +131,7 @@ struct Network::Run {
     if (step.opcode == Opcode::linear && step.norm.dim > 0) {
       return batch * a[2] * a[3] * static_cast<int64_t>(sizeof(float)) + kSpare;
     }
-    return step.is_block() ? step.block.scratch(part(step) * a[1] * a[2]) : 0;
+    return step.opcode == Opcode::block ? step.block.scratch(part(step) * a[1] * a[2]) : 0;
   }
 
   // The two inner axes are a matrix, of which a thread takes a piece at once.
@@ -239,7 +262,7 @@ struct Network::Run {
       const float *x = image(a[0], b), *points = image(a[7], b) + y * columns * 2;
       float* out = result(a[1], b) + y * columns * channels;
       for (int64_t k = 0; k < columns; ++k, out += channels, points += 2) {
-        sample_at(x, height, width, channels, points[0], points[1], out, channels);
+        sample_at(x, height, width, channels, points[0], points[1], out);
       }
     });
   }
@@ -272,7 +295,6 @@ struct Network::Run {
       case Opcode::norm:
         return normalize(all(a[0]), batch * a[2], step.norm, to[a[1]]);
       case Opcode::block:
-      case Opcode::deform:
         return blocks(&step, &step + 1, scratch);
       case Opcode::copy:
         return copy(a);
@@ -335,8 +357,8 @@ void Network::run(int64_t batch, const Input* given, float* const* results) cons
   }
   for (size_t k = 0; k < steps.size();) {
     size_t end = k + 1;
-    if (steps[k].is_block()) {
-      while (end < steps.size() && steps[end].is_block() &&
+    if (steps[k].opcode == Opcode::block) {
+      while (end < steps.size() && steps[end].opcode == Opcode::block &&
              steps[end].arguments[0] == steps[k].arguments[0]) {
         ++end;
       }

@@ -209,8 +209,6 @@ TensorFile::TensorFile(const std::string& path) {
   int64_t size = 0;
   content = content_of(path, size);
   const std::string_view file(content.get(), size);
-  require(!file.starts_with("PK\3\4"),
-          "it comes from an older version of darswin: export the network again");
   require(crc_of(file) == kWhole, "it is damaged, or of another kind");
   uint64_t length = 0;
   std::memcpy(&length, file.data(), kLength);

@@ -1,4 +1,4 @@
-// Reads the arrays and the texts of a file in the layout of safetensors, as write_tensors of
+// Reads the arrays and the texts of a file in the layout of safetensors, as
 // darswin/frames/tensor_file.py writes it. docs/reference/files.md describes it byte by byte.
 #pragma once
 
@@ -19,6 +19,13 @@ namespace darswin {
 // is right.
 class TensorFile {
  public:
+  struct Tensor {
+    std::string type;  // such as "F32"
+    std::vector<int64_t> shape;
+    int64_t count;  // of its numbers
+    const char* data;
+  };
+
   explicit TensorFile(const std::string& path);
 
   // The array of this name and type, flat, in C order.
@@ -39,14 +46,10 @@ class TensorFile {
   const std::string* find_text(std::string_view name) const;
   const std::string& text(std::string_view name) const;
 
- private:
-  struct Tensor {
-    std::string type;  // such as "F32"
-    std::vector<int64_t> shape;
-    int64_t count;  // of its numbers
-    const char* data;
-  };
+  std::map<std::string, Tensor, std::less<>> tensors;
+  std::map<std::string, std::string, std::less<>> texts;
 
+ private:
   [[noreturn]] static void wrong(std::string_view name, const std::string& what);
   const Tensor& tensor(std::string_view name) const;
   const Tensor& tensor(std::string_view name, std::string_view type) const;
@@ -54,8 +57,6 @@ class TensorFile {
   static constexpr std::string_view type_of = "";
 
   std::shared_ptr<const char> content;
-  std::map<std::string, Tensor, std::less<>> tensors;
-  std::map<std::string, std::string, std::less<>> texts;
 };
 
 template <>

@@ -27,15 +27,6 @@ void add(const float* x, float* to, int64_t n) {
   for (; k < n; ++k) to[k] += x[k];
 }
 
-void add_products(const float* x, const float* y, float* to, int64_t n) {
-  const auto at = [&]<typename V>(int64_t k) {
-    store(to + k, load<V>(to + k) + load<V>(x + k) * load<V>(y + k));
-  };
-  int64_t k = 0;
-  for (; k + kL <= n; k += kL) at.template operator()<Floats>(k);
-  for (; k < n; ++k) at.template operator()<float>(k);
-}
-
 void gelu_all(float* x, int64_t n) {
   replace(x, n, [](Floats v) { return gelu(v); });
 }
@@ -81,7 +72,6 @@ void mix(const float* const from[4], const float weights[4], float* to, int64_t 
 }  // namespace
 
 TIER_TABLE(ElementKernels) = {.add = add,
-                              .add_products = add_products,
                               .gelu = gelu_all,
                               .relu = relu_all,
                               .largest = largest,

@@ -176,8 +176,66 @@ void places(PolarSampleArgs<float> a, double* angles, int64_t padded, int16_t* c
   }
 }
 
+// Adds `kCount` channels of a picture at a point to their sum.
+template <int kCount, typename T>
+void add_point(const ReadArgs<T>& a, const T* picture, float x, float y, float* sum) {
+  const int height = static_cast<int>(a.height), width = static_cast<int>(a.width);
+  if (!(x > -1 && x < static_cast<float>(width) && y > -1 && y < static_cast<float>(height))) {
+    return;  // NaN too
+  }
+  // The floor. That of x + 1 may round to another pixel, below a power of 2.
+  const int column = x < 0 ? -1 : static_cast<int>(x), row = y < 0 ? -1 : static_cast<int>(y);
+  const float right = x - static_cast<float>(column), lower = y - static_cast<float>(row);
+  float across[] = {1 - right, right}, down[] = {1 - lower, lower};
+  int64_t next = a.channels, below = a.width * a.channels;
+  const T* upper = picture + row * below + column * next;
+  // A neighbour outside has no weight, and the one inside is read in its place.
+  if (column < 0 || column + 1 >= width) {
+    if (column < 0) across[0] = 0, upper += next;
+    if (column + 1 >= width) across[1] = 0;
+    next = 0;
+  }
+  if (row < 0 || row + 1 >= height) {
+    if (row < 0) down[0] = 0, upper += below;
+    if (row + 1 >= height) down[1] = 0;
+    below = 0;
+  }
+  const T* under = upper + below;
+  for (int c = 0; c < kCount; ++c) {
+    sum[c] += down[0] * (across[0] * upper[c] + across[1] * upper[next + c]) +
+              down[1] * (across[0] * under[c] + across[1] * under[next + c]);
+  }
+}
+
+// Reads `kCount` channels at once.
+template <int kCount, typename T>
+void read_rows(const ReadArgs<T>& a, int64_t rows) {
+  const float share = 1.0f / static_cast<float>(a.reads * a.reads);
+  T* to = a.to;
+  for (int64_t y = 0; y < rows; ++y) {
+    for (int64_t x = 0; x < a.columns; ++x) {
+      const float* points = a.points + 2 * (y * a.reads * a.columns + x) * a.reads;
+      for (int64_t channel = 0; channel < a.channels; channel += kCount, to += kCount) {
+        float sum[kCount] = {};
+        for (int64_t k = 0; k < a.reads; ++k) {
+          const float* point = points + 2 * k * a.columns * a.reads;
+          for (int64_t i = 0; i < a.reads; ++i, point += 2) {
+            add_point<kCount>(a, a.picture + channel, point[0], point[1], sum);
+          }
+        }
+        for (int c = 0; c < kCount; ++c) {
+          const float mean = sum[c] * share;
+          to[c] = static_cast<T>(sizeof(T) == 1 ? to_byte(mean) : mean);
+        }
+      }
+    }
+  }
+}
+
 }  // namespace
 
 TIER_TABLE(FrameKernels) = {.places = places, .sample = sample};
+TIER_TABLE(ReadKernels<uint8_t>) = {read_rows<1>, read_rows<3>, read_rows<4>};
+TIER_TABLE(ReadKernels<float>) = {read_rows<1>, read_rows<3>, read_rows<4>};
 
 }  // namespace darswin

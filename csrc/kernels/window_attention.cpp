@@ -126,15 +126,7 @@ struct Attention {
 
   // Writes to[key * stride + query - begin] = the bias of (query, key).
   void spread_bias(int64_t begin, int64_t end, T* to, int64_t stride) const {
-    const int64_t row = bias_row * shape.heads + head, n = shape.n;
-    if (a.dense) {
-      const T* biases = a.bias + row * n * n;
-      for (int64_t key = 0; key < n; ++key) {
-        for (int64_t i = begin; i < end; ++i) to[key * stride + i - begin] = biases[key * n + i];
-      }
-      return;
-    }
-    const T* table = a.bias + row * shape.table;
+    const T* table = a.bias + (bias_row * shape.heads + head) * shape.table;
     shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
       T* biases = to + key * stride + query - begin;
       for (int64_t i = 0; i < count; ++i) biases[i] = table[index + i];

@@ -5,13 +5,13 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <cctype>
 #include <cerrno>
 #include <memory>
 #include <optional>
 #include <span>
 #include <string>
 #include <system_error>
-#include <type_traits>
 #include <vector>
 
 #include "../core/dispatch.h"
@@ -158,18 +158,36 @@ py::object run_network(const FrameNetwork& network, const py::object& given, con
   return out.is_none() ? results : out;
 }
 
-// Returns a function that runs the network of a file, and what the file says of it: the size of the
-// frames, the shapes of the outputs, and the labels.
-py::tuple open_network(const std::string& path) {
-  std::shared_ptr<const FrameNetwork> network;
+// Opens a file. What the system cannot read is an OSError.
+template <typename File>
+std::shared_ptr<const File> opened(const std::string& path) {
   try {
     const py::gil_scoped_release free;
-    network = std::make_shared<const FrameNetwork>(path);
+    return std::make_shared<const File>(path);
   } catch (const std::system_error& error) {
     errno = error.code().value();
     PyErr_SetFromErrnoWithFilename(PyExc_OSError, path.c_str());
     throw py::error_already_set();
   }
+}
+
+// Returns the arrays and the texts of a file.
+py::tuple read_tensors(const std::string& path) {
+  const auto file = opened<TensorFile>(path);
+  py::dict arrays;
+  for (const auto& [name, tensor] : file->tensors) {
+    // NumPy's "i4" is "I32" here.
+    const std::string bytes = std::to_string(std::stoi(tensor.type.substr(1)) / 8);
+    const py::dtype kind(static_cast<char>(std::tolower(tensor.type[0])) + bytes);
+    arrays[py::str(name)] = py::array(kind, tensor.shape, tensor.data);  // a copy
+  }
+  return py::make_tuple(arrays, file->texts);
+}
+
+// Returns a function that runs the network of a file, and what the file says of it: the size of the
+// frames, the shapes of the outputs, and the labels.
+py::tuple open_network(const std::string& path) {
+  const auto network = opened<FrameNetwork>(path);
   const py::cpp_function run(
       [network](const py::object& frame, const py::object& out, int64_t threads) {
         return run_network(*network, frame, out, threads);
@@ -211,101 +229,34 @@ py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
   return py::make_tuple(columns, rows, right, lower);
 }
 
-// Adds a picture (H, W, C) at n points to sum (C,), bilinearly, with 0 outside. C is `kChannels`,
-// or `channels` if that is 0. Points of which nothing is inside, and NaN, are skipped.
-template <int kChannels, typename T>
-void add_points(const T* picture, int height, int width, int channels, const float* xs,
-                const float* ys, int64_t n, float* sum) {
-  const int count = kChannels ? kChannels : channels;
-  const float high = static_cast<float>(height), wide = static_cast<float>(width);
-  for (int64_t i = 0; i < n; ++i) {
-    const float x = xs[i], y = ys[i];
-    if (!(x > -1 && x < wide && y > -1 && y < high)) continue;
-    // The floor. That of x + 1 may round to another pixel, below a power of 2.
-    const int column = x < 0 ? -1 : static_cast<int>(x), row = y < 0 ? -1 : static_cast<int>(y);
-    const float right = x - static_cast<float>(column), lower = y - static_cast<float>(row);
-    float weights[] = {(1 - lower) * (1 - right), (1 - lower) * right, lower * (1 - right),
-                       lower * right};
-    const T* pixel = picture + (static_cast<int64_t>(row) * width + column) * count;
-    int64_t to_right = count, to_lower = static_cast<int64_t>(width) * count;
-    if (column < 0 || row < 0 || column + 1 >= width || row + 1 >= height) {
-      // A neighbour outside has no weight, and the one inside is read in its place.
-      if (column < 0) {
-        weights[0] = weights[2] = 0;
-        pixel += to_right;
-      }
-      if (row < 0) {
-        weights[0] = weights[1] = 0;
-        pixel += to_lower;
-      }
-      if (column + 1 >= width) weights[1] = weights[3] = 0;
-      if (row + 1 >= height) weights[2] = weights[3] = 0;
-      if (column < 0 || column + 1 >= width) to_right = 0;
-      if (row < 0 || row + 1 >= height) to_lower = 0;
-    }
-    for (int k = 0; k < count; ++k, ++pixel) {
-      sum[k] += (weights[0] * pixel[0] + weights[1] * pixel[to_right]) +
-                (weights[2] * pixel[to_lower] + weights[3] * pixel[to_lower + to_right]);
-    }
-  }
-}
-
-template <int kChannels, typename T>
-void read_pixels(const T* picture, int height, int width, int channels, const float* xs,
-                 const float* ys, int64_t rows, int64_t columns, int64_t reads, T* to) {
-  const int count = kChannels ? kChannels : channels;
-  std::vector<float> any(kChannels ? 0 : count);
-  const float share = 1.0f / static_cast<float>(reads * reads);
-  for (int64_t y = 0; y < rows; ++y) {
-    for (int64_t x = 0; x < columns; ++x, to += count) {
-      float few[kChannels ? kChannels : 1] = {};  // in registers
-      float* const sum = kChannels ? few : any.data();
-      if (!kChannels) std::fill(any.begin(), any.end(), 0.0f);
-      for (int64_t k = 0; k < reads; ++k) {
-        const int64_t first = ((y * reads + k) * columns + x) * reads;
-        add_points<kChannels>(picture, height, width, count, xs + first, ys + first, reads, sum);
-      }
-      for (int c = 0; c < count; ++c) {
-        const float mean = sum[c] * share;
-        if constexpr (std::is_same_v<T, uint8_t>) {
-          to[c] = static_cast<uint8_t>(mean < 255 ? static_cast<int>(mean + 0.5f) : 255);
-        } else {
-          to[c] = mean;
-        }
-      }
-    }
-  }
-}
-
-// A picture (H, W, C) at points x and y (k·H', k·W'): (H', W', C), each the mean of k² points. For
-// a picture or two through one lens: a sampler first arranges the points for many.
+// A picture (H, W, C) at points (k·H', k·W', 2): (H', W', C), each the mean of k² points. For a
+// picture or two through one lens: a sampler first arranges the points for many.
 template <typename T>
-py::array_t<T> read(const Array<T>& picture, const Array<float>& x, const Array<float>& y,
-                    int64_t reads) {
-  if (picture.ndim() != 3 || x.ndim() != 2 || y.ndim() != 2 || x.shape(0) != y.shape(0) ||
-      x.shape(1) != y.shape(1) || reads < 1 || x.shape(0) % reads || x.shape(1) % reads) {
-    throw py::value_error("expected a picture (H, W, C), and x and y (k·H', k·W')");
+py::array_t<T> read(const Array<T>& picture, const Array<float>& points, int64_t reads) {
+  if (picture.ndim() != 3 || points.ndim() != 3 || points.shape(2) != 2 || reads < 1 ||
+      points.shape(0) % reads || points.shape(1) % reads) {
+    throw py::value_error("expected a picture (H, W, C), and points (k·H', k·W', 2)");
   }
   constexpr int64_t kMost = 1 << 24;  // exact in float
-  if (std::max({picture.shape(0), picture.shape(1), picture.shape(2)}) > kMost) {
-    throw py::value_error("a picture has at most 2^24 rows, columns and channels");
+  if (std::max(picture.shape(0), picture.shape(1)) > kMost || picture.size() == 0) {
+    throw py::value_error("a picture has 1 to 2^24 rows and columns, and channels");
   }
-  const int height = static_cast<int>(picture.shape(0)), width = static_cast<int>(picture.shape(1));
-  const int channels = static_cast<int>(picture.shape(2));
-  const int64_t rows = x.shape(0) / reads, columns = x.shape(1) / reads;
-  py::array_t<T> result({rows, columns, static_cast<int64_t>(channels)});
-  const auto run = channels == 3   ? read_pixels<3, T>
-                   : channels == 1 ? read_pixels<1, T>
-                                   : read_pixels<0, T>;
-  const T* from = picture.data();
-  const float *xs = x.data(), *ys = y.data();
-  T* to = result.mutable_data();
+  const int64_t rows = points.shape(0) / reads, columns = points.shape(1) / reads;
+  py::array_t<T> result({rows, columns, picture.shape(2)});
+  const ReadArgs<T> args{.picture = picture.data(),
+                         .height = picture.shape(0),
+                         .width = picture.shape(1),
+                         .channels = picture.shape(2),
+                         .points = points.data(),
+                         .columns = columns,
+                         .reads = reads,
+                         .to = result.mutable_data()};
   const py::gil_scoped_release others_may_run;
-  if (width == 0 || height == 0) {
-    std::fill_n(to, rows * columns * channels, T{});
-    return result;
-  }
-  run(from, height, width, channels, xs, ys, rows, columns, reads, to);
+  const auto& kernel = kernels<ReadKernels<T>>();
+  const auto run = args.channels == 3   ? kernel.three
+                   : args.channels == 4 ? kernel.four
+                                        : kernel.any;
+  run(args, rows);
   return result;
 }
 
@@ -339,7 +290,8 @@ PYBIND11_MODULE(_frames, m) {
         py::name("sample"), py::arg("frame"), py::arg("out") = py::none(), py::arg("threads") = 1);
   });
   m.def("network", &open_network);
+  m.def("read_tensors", &read_tensors);
   m.def("polar_places", &polar_places);
-  m.def("read", &read<uint8_t>, py::arg().noconvert(), py::arg(), py::arg(), py::arg());
-  m.def("read", &read<float>, py::arg().noconvert(), py::arg(), py::arg(), py::arg());
+  m.def("read", &read<uint8_t>, py::arg().noconvert(), py::arg(), py::arg());
+  m.def("read", &read<float>, py::arg().noconvert(), py::arg(), py::arg());
 }

@@ -11,7 +11,6 @@ from torch.overrides import handle_torch_function, has_torch_function_unary
 
 import darswin.ops  # noqa: F401  (it registers our operators)
 from darswin.layers.quantized import Quantization, quantized_layers
-from darswin.models.dat import DeformableAttention
 from darswin.ops import _module
 
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -93,32 +92,15 @@ def own_linear(layer: Any, norm: nn.LayerNorm | None = None, *, gelu: bool = Fal
     return OwnLinear(packed_weights(layer), layer.out_features, gelu=gelu, norm=before)
 
 
-class PackedDeformable:
-    """What deformable attention has besides the parts of a block, packed.
-
-    Attributes:
-        around: the convolution for the channels of all groups, channels last, then its bias.
-    """
-
-    def __init__(self, attn: DeformableAttention):
-        self.groups, self.kernel = attn.groups, attn.around.kernel_size[0]
-        self.reach = attn.offset_range
-        bias: Any = attn.around.bias
-        taps = [*attn.around.weight.flatten(1).t(), bias]
-        self.around = torch.cat([tap.repeat(attn.groups) for tap in taps]).detach().float()
-        self.norm = OwnNorm(attn.norm)
-        self.offset, self.kv = packed_weights(attn.offset), packed_weights(attn.kv)
-
-
 class PackedBlocks:
-    """The blocks of a stage, packed. All of them have window attention or deformable attention."""
+    """The blocks of a stage, packed. All of them have window attention."""
 
     def __init__(self, blocks: Sequence[Any]):
-        # Of each block: norm1, qkv (in deformable attention q alone), proj, norm2, fc1 and fc2.
+        # Of each block: norm1, qkv, proj, norm2, fc1 and fc2.
         self.layers: list[tuple[OwnNorm, Tensor, Tensor, OwnNorm, Tensor, Tensor]] = [
             (
                 OwnNorm(block.norm1),
-                packed_weights(block.attn.q if _deforms(block) else block.attn.qkv),
+                packed_weights(block.attn.qkv),
                 packed_weights(block.attn.proj),
                 OwnNorm(block.norm2),
                 packed_weights(block.mlp.fc1),
@@ -126,15 +108,9 @@ class PackedBlocks:
             )
             for block in blocks
         ]
-        self.deformable = [
-            PackedDeformable(block.attn) if _deforms(block) else None for block in blocks
-        ]
         # Of each block: the window, the shift, and whether an axis is periodic.
         self.windows: list[list[int]] = [
-            [*block.attn.map_size, 0, 0, 0, 0]
-            if _deforms(block)
-            else [*block.attn.window, *block.attn.shift, *block.attn.periodic]
-            for block in blocks
+            [*block.attn.window, *block.attn.shift, *block.attn.periodic] for block in blocks
         ]
         attn = blocks[0].attn
         self.heads, self.mlp_dim = attn.num_heads, blocks[0].mlp.fc1.out_features
@@ -144,7 +120,3 @@ class PackedBlocks:
     def table_shapes(self) -> list[tuple[int, int, int]]:
         """The shape of the position bias of each block."""
         return [(self.heads, 2 * w[0] - 1, 2 * w[1] - 1) for w in self.windows]
-
-
-def _deforms(block: Any) -> bool:
-    return isinstance(block.attn, DeformableAttention)

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.deploy.own import PackedBlocks
-from darswin.deploy.program import Checked, Program, Weights
+from darswin.deploy.program import Checked, NoProgramError, Program, Weights
+from darswin.deploy.record import Recorded
 from darswin.layers.attention import WindowAttention
-from darswin.models.dat import DeformableAttention
 
 # The map of a stage, which may change, and the position biases of its blocks → the map.
 Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
@@ -41,13 +41,15 @@ class OwnBlocks(PackedBlocks):
 
 
 def blocks_of(blocks: Sequence[Any], weights: Weights) -> Blocks:
-    """The blocks of a stage: one operator, if all have window or deformable attention."""
-    own = WindowAttention, DeformableAttention
-    if blocks and all(isinstance(block.attn, own) for block in blocks):
+    """The blocks of a stage: one operator, if all have window attention."""
+    others = [block.attn for block in blocks if not isinstance(block.attn, WindowAttention)]
+    if blocks and not others:
         return OwnBlocks(blocks, weights)
     layers = [InFloat32(block) for block in blocks]
 
     def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        if others and isinstance(x, Recorded):
+            raise NoProgramError(f"{type(others[0]).__name__} is no instruction")
         for layer, table in zip(layers, tables, strict=True):
             x = layer(x, table)
         return x

@@ -11,19 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.deploy.own import (
-    OwnLinear,
-    OwnNorm,
-    PackedBlocks,
-    PackedDeformable,
-    own_operator,
-    pack,
-)
+from darswin.deploy.own import OwnLinear, OwnNorm, PackedBlocks, own_operator, pack
 
 _NETWORK, _FORGET, _RUN = map(own_operator, ("_network", "_forget_network", "_run"))
 
-(LINEAR, NORM, BLOCK, COPY, ADD, MEAN, APPLY, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE, POOL,
- DEFORM) = range(14)  # fmt: skip
+(LINEAR, NORM, BLOCK, COPY, ADD, MEAN, APPLY, CONV, RESIZE, SAMPLE, TO_IMAGE, DISTANCE,
+ POOL) = range(13)  # fmt: skip
 NOTHING, GELU, RELU = range(3)  # what follows a product
 COPY_AXES = 5
 
@@ -235,23 +228,16 @@ class Program:
         """The blocks of a stage."""
         (rings, sectors, dim), out = x.shape, self.buffer(*x.shape)
         base: Slot | None = x
-        steps = zip(blocks.layers, blocks.windows, blocks.deformable, tables, strict=True)
-        for (norm1, qkv, proj, norm2, fc1, fc2), windows, deformable, table in steps:
+        steps = zip(blocks.layers, blocks.windows, tables, strict=True)
+        for (norm1, qkv, proj, norm2, fc1, fc2), windows, table in steps:
             self._step(
-                DEFORM if deformable else BLOCK, out, [x if base else out, table], out, rings,
-                sectors, dim, blocks.heads, blocks.mlp_dim, self._norm_offset(norm1),
-                *self._layer(qkv), *self._layer(proj), self._norm_offset(norm2),
-                *self._layer(fc1), *self._layer(fc2), *windows, table,
-                *self._deformable(deformable), base=base,
+                BLOCK, out, [x if base else out, table], out, rings, sectors, dim, blocks.heads,
+                blocks.mlp_dim, self._norm_offset(norm1), *self._layer(qkv), *self._layer(proj),
+                self._norm_offset(norm2), *self._layer(fc1), *self._layer(fc2), *windows, table,
+                base=base,
             )  # fmt: skip
             base = None
         return out
-
-    def _deformable(self, of: PackedDeformable | None) -> Sequence[int]:
-        if of is None:
-            return ()
-        places = map(self.weights.offset, (of.around, of.norm.words, of.offset, of.kv))
-        return of.groups, of.kernel, _bits(of.reach), *places
 
     def copy(
         self,
@@ -325,13 +311,8 @@ class Program:
 
     def distance(self, x: Slot, typical: float) -> Slot:
         """The distances of a `DistanceHead`."""
-        out = self.buffer(*x.shape)
-        return self._step(DISTANCE, out, [x], out, _bits(typical), base=x)
-
-
-def _bits(number: float) -> int:
-    """The bits of a float of 32 bits."""
-    return struct.unpack("<i", struct.pack("<f", number))[0]
+        bits, out = struct.unpack("<i", struct.pack("<f", typical)), self.buffer(*x.shape)
+        return self._step(DISTANCE, out, [x], out, *bits, base=x)
 
 
 def _copy(

@@ -50,6 +50,10 @@ class Frames(Protocol):
         outputs, and its labels."""
 
     @staticmethod
+    def read_tensors(path: bytes, /) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """The arrays and the texts of a file."""
+
+    @staticmethod
     def polar_places(
         radii: np.ndarray,
         azimuths: np.ndarray,
@@ -62,11 +66,9 @@ class Frames(Protocol):
         """The places of the points of a polar grid: columns, rows, right, lower."""
 
     @staticmethod
-    def read(
-        picture: np.ndarray, x: np.ndarray, y: np.ndarray, supersampling: int, /
-    ) -> np.ndarray:
-        """A picture (H, W, C) of uint8 or float32 at points x and y (k·H', k·W'): (H', W', C), each
-        the mean of k² points, with 0 outside."""
+    def read(picture: np.ndarray, points: np.ndarray, supersampling: int, /) -> np.ndarray:
+        """A picture (H, W, C) of uint8 or float32 at points (k·H', k·W', 2): (H', W', C), each the
+        mean of k² points, with 0 outside."""
 
 
 try:

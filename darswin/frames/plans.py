@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, cast, get_args
 import numpy as np
 
 from darswin.frames.compiled import frames
-from darswin.frames.tensor_file import read_tensors, write_tensors
+from darswin.frames.tensor_file import write_tensors
 from darswin.utils.tables import read_table
 
 Output = Literal["tokens", "image", "uint8"]
@@ -226,7 +226,7 @@ class Plan:
             OSError: the file cannot be read.
         """
         try:
-            arrays, texts = read_tensors(path)
+            arrays, texts = frames.read_tensors(os.fsencode(path))
             version = int(texts["darswin_plan"])
             if version > _VERSION:
                 raise ValueError("it comes from a newer version of darswin: update darswin")

@@ -40,7 +40,6 @@ class DeformableAttention(nn.Module):
         check_heads(dim, num_heads)
         if groups < 1 or num_heads % groups:
             raise ValueError(f"groups must divide num_heads = {num_heads}, got {groups}")
-        self.dim, self.map_size = dim, map_size
         self.num_heads, self.groups, self.offset_range = num_heads, groups, offset_range
         channels = dim // groups
         self.q = Linear(dim, dim)

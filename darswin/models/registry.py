@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
-from darswin.models.described import renewed
 from darswin.utils.nearest import did_you_mean
 from darswin.views import View, make_view
 
@@ -64,9 +63,6 @@ def model_class(name: str) -> type[Model]:
     """The class of the model with this name; ValueError for an unknown name."""
     if name in list_pretrained():
         raise ValueError(f"{name!r} is a trained model: load_model({name!r}) loads it")
-    model, options = renewed(name, {})
-    if model != name:
-        raise ValueError(f"{name!r} is now {model!r} with the options {options}")
     if name not in _MODELS:
         raise ValueError(f"unknown model {name!r}{nearest_models(name, list_models())}")
     return _MODELS[name][0]

@@ -15,7 +15,7 @@ from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import short
 from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
-from darswin.models.described import described, renewed
+from darswin.models.described import described
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, list_pretrained, no_weights, pretrained_file
@@ -186,16 +186,7 @@ def _parsed(entry: str) -> ModelCard:
         fits, expected = _FIELDS[name]
         if not fits(value):
             raise ValueError(f"its {name} must be {expected}, got {short(value)}")
-    try:
-        return card_of(known)
-    except TypeError as error:  # of an angle that is no number
-        raise ValueError(f"its options {short(known['options'])} have a wrong type") from error
-
-
-def card_of(values: Mapping[str, Any]) -> ModelCard:
-    """The card with these fields, which an older darswin may have written."""
-    model, options = renewed(values["model"], values.get("options", {}))
-    return ModelCard(**{**values, "model": model, "options": options})
+    return ModelCard(**known)
 
 
 def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Encoder | PixelModel:

@@ -230,7 +230,7 @@ class Unet(PixelModel):
 @register_model("darswin_unet_a", kind=Unet, variant="A", presets=_POLAR)
 @register_model("darswin_unet_ra", kind=Unet, variant="RA", presets=_POLAR)
 def darswin_unet(view: Literal["polar"] = "polar", **options: Any) -> Unet:
-    """A `Unet` with a DarSwin encoder, from the options of both. Older files name its view."""
+    """A `Unet` with a DarSwin encoder, from the options of both."""
     if view != "polar":
         raise ValueError(f"view must be 'polar', got {view!r}: a swin_unet takes other views")
     return _unet(DarSwin, options)

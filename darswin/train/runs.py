@@ -13,7 +13,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from darswin.models.saving import card_of, save_model
+from darswin.models.saving import ModelCard, save_model
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import naming
 from darswin.utils.unpickle import read_pickle
@@ -125,7 +125,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
             if name.startswith("net.")
         }
         file = Path(path).with_suffix(".safetensors")
-        save_model(file, weights, card_of(checkpoint["darswin"]))
+        save_model(file, weights, ModelCard(**checkpoint["darswin"]))
 
     def remove_checkpoint(self, path: str | Path) -> None:
         super().remove_checkpoint(path)

@@ -20,7 +20,7 @@ from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import has_image_size
-from darswin.models.saving import ModelCard, card_of, read_card
+from darswin.models.saving import ModelCard, read_card
 from darswin.ops.checks import readable
 from darswin.train.finetuning import (
     check_name,
@@ -258,7 +258,7 @@ class TaskModule(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """ValueError if the checkpoint belongs to another model."""
         self._steps_there = checkpoint.get("steps_per_epoch")
-        self.trained = card_of(checkpoint["darswin"])
+        self.trained = ModelCard(**checkpoint["darswin"])
         theirs, ours = (
             {**card, **card.pop("options")} for card in (asdict(self.trained), asdict(self.card))
         )

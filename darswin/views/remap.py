@@ -227,8 +227,7 @@ class Remap:
             from darswin.frames.compiled import frames
 
             supersampling = self.points.shape[1] // self.view_size[1]
-            x, y = np.moveaxis(self.points, -1, 0)
-            seen = frames.read(planes, x, y, supersampling)
+            seen = frames.read(planes, self.points, supersampling)
         else:
             images = as_tensor(planes).movedim(2, 0)[None]
             images = images if images.is_floating_point() else images.float()

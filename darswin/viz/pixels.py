@@ -5,7 +5,7 @@ Distances are (H, W) in metres. They are unknown, and grey, if they are 0 or not
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 
 import cv2
 import matplotlib
@@ -36,14 +36,18 @@ _WRONG, _RIGHT = (213, 0, 50), (222, 222, 222)
 # Okabe and Ito's colours without black.
 _FIRST = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233),
           (213, 94, 0), (240, 228, 66))  # fmt: skip
-# The linear RGB that people without red or green cones see: Machado, Oliveira and Fernandes (2009).
-_SEEN = np.array([
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
-     [-0.003882, -0.048116, 1.051998]],
-    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
-     [-0.011820, 0.042940, 0.968881]],
-])  # fmt: skip
+# Those after them, a digit for each of r, g and b. Of all such colours, each differs most from
+# those before it, also for people who do not see red or green.
+_MORE = (
+    "00fbfa004430109eff76f5356b61385da763644ff869fbdf00243d34b321ffd068dc66dc3bc225d74ff2006b18740"
+    "17d423c1ad34e0629d8d84b99c300bde65c8c025fbff6be882238b709f860269cf72f95510321230d5cc9068ec25d"
+    "cef224d83d5c42bf488afc2f21081326da36d81169437fb4c52308099da5efe34aef9d77fe3507747d75a9b5344bd"
+    "602c65005957343de7001fba2329830239ced99851ffb8439edbab48e700d2acbb45b113bf542abd58747d710a745"
+    "114ff70a8fc0da8654134279ade21127afc9b5649c71638603508c14982c01537e638ffc852fa0e538645c6a8b341"
+    "7bf36b7076eb11610724612c73748d84c83ffaaf5ab29275735eb7dbd7fc9fddeee47c3359e81981a419bb4dda79a"
+    "7b7c94608947d88caa85c0dd65ef9350e0446ae811dd79be13c00c54c72bd6fb50713b86c28db9b5b48315432dee9"
+    "fc4f2ce39af8d68d95f69e8d99564ec9ce62b55442474176fe5e5d2a2363562f96a79ffa510e3e8e9ae1ceb3e6672"
+)  # fmt: skip
 
 Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # image (H, W, 1 or 3) uint8, truth, prediction
 # Pictures of truth, prediction and error, and the error in words.
@@ -62,37 +66,8 @@ def palette(count: int) -> list[list[int]]:
     """
     if not 0 <= count <= MOST_CLASSES:
         raise ValueError(f"a palette has 0 to {MOST_CLASSES} colours, got {count}")
-    return [list(color) for color in _palette()[:count]]
-
-
-@cache
-def _palette() -> tuple[tuple[int, ...], ...]:
-    levels = np.arange(0, 256, 17)
-    candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), -1).reshape(-1, 3)
-    seen = _as_seen(candidates)
-    chosen = [tuple(color) for color in _FIRST]
-    # Black stays free for lines and text on the colours.
-    unlike = np.full(len(candidates), np.inf)
-    for color in (UNKNOWN, (0, 0, 0), *chosen):
-        unlike = np.minimum(unlike, _difference(seen, _as_seen(np.array([color]))))
-    while len(chosen) < MOST_CLASSES:
-        best = int(unlike.argmax())
-        chosen.append(tuple(candidates[best].tolist()))
-        unlike = np.minimum(unlike, _difference(seen, seen[:, best : best + 1]))
-    return tuple(chosen)
-
-
-def _as_seen(colors: np.ndarray) -> np.ndarray:
-    """Converts sRGB (N, 3) to CIELAB for each kind of colour vision: (3, N, 3)."""
-    part = colors / 255
-    linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
-    seen = (linear @ _SEEN.transpose(0, 2, 1)).clip(0, 1).astype(np.float32)
-    return cv2.cvtColor(seen, cv2.COLOR_LRGB2Lab)
-
-
-def _difference(colors: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """The smallest ΔE*76 over all kinds of colour vision, (N,)."""
-    return np.linalg.norm(colors - color, axis=-1).min(0)
+    more = ([17 * int(level, 16) for level in _MORE[k : k + 3]] for k in range(0, len(_MORE), 3))
+    return [*map(list, _FIRST), *more][:count]
 
 
 def label_image(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> np.ndarray:

@@ -30,7 +30,7 @@ def test_facts_of_this_machine(capsys):
     ("model", "way"),
     [
         ("darswin_a_nano", "one program"), ("conv_unet_nano", "one program"),
-        ("digits", "one program"), ("dat_nano", "one program"),
+        ("digits", "one program"), ("dat_nano", "layer by layer, because of stages.1"),
         ("swin_unet_nano", "layer by layer, because of segmentation_head"),
     ],
 )  # fmt: skip

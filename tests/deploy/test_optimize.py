@@ -21,7 +21,7 @@ LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("name", "lenses"),
-    [*itertools.product(["darswin_a_nano", "swin_nano perspective", "dat_nano"], [1, 200]),
+    [*itertools.product(["darswin_a_nano", "swin_nano perspective"], [1, 200]),
      *(pytest.param("darswin_unet_a_nano", n, marks=pytest.mark.slow) for n in (1, 200))],
 )  # fmt: skip
 def test_large_batches_have_the_bits_of_small_ones(name, lenses):

@@ -194,7 +194,7 @@ def test_what_is_no_instruction_is_named_with_its_module(function, said):
 
 @torch.no_grad()
 def test_a_model_that_is_no_program_says_why():
-    model, images = network("dat_nano"), torch.randn(2, 3, 32, 32)
+    model, images = network("swin_nano"), torch.randn(2, 3, 32, 32)
     model.head = nn.Sequential(model.head, nn.Softplus())
     fast = optimize(model)
     assert "layer by layer, because of head.1 (Softplus): " in repr(fast)

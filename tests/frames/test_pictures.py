@@ -126,4 +126,4 @@ def test_points_at_the_edges_are_read_inside(side):
     x, y = np.meshgrid([-1, *ends, -1e-9, 0, side - 1, side], [*ends, 0, side - 1])
     x, y = x.astype(np.float32), y.astype(np.float32)
     expected = bilinear(picture.astype(np.float64), x.astype(float), y.astype(float))
-    np.testing.assert_allclose(compiled.read(picture, x, y, 1), expected, atol=1e-3)
+    np.testing.assert_allclose(compiled.read(picture, np.stack((x, y), -1), 1), expected, atol=1e-3)

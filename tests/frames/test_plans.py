@@ -284,17 +284,18 @@ def test_a_picture_is_read_at_any_points(data):
         weight = weight * np.clip(1 - np.abs(points[..., 1, None, None].astype(float) - y), 0, None)
     expected = np.einsum("ijyx,yxc->ijc", np.nan_to_num(weight), picture.astype(float))
     expected = expected.reshape(rows, k, columns, k, channels).mean((1, 3))
-    found = compiled.read(picture, points[..., 0], points[..., 1], k)
+    found = compiled.read(picture, points, k)
     assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 0.5 + 1e-3
-    exact = compiled.read(picture.astype(np.float32), points[..., 0], points[..., 1], k)
+    exact = compiled.read(picture.astype(np.float32), points, k)
     np.testing.assert_allclose(exact, expected, atol=1e-3)
 
 
 def test_what_cannot_be_read_is_refused():
-    picture, x = np.zeros((3, 4, 1), np.uint8), np.zeros((2, 4), np.float32)
-    for wrong in ((picture[0], x, x, 1), (picture, x[0], x[0], 1), (picture, x, x, 3),
-                  (picture, x, x, 0), (picture, x, x[:1], 1),
-                  (picture, x, x[:, :2], 1)):  # fmt: skip
+    picture, points = np.zeros((3, 4, 1), np.uint8), np.zeros((2, 4, 2), np.float32)
+    for wrong in ((picture[0], points, 1), (picture, points[0], 1), (picture, points, 3),
+                  (picture, points, 0), (picture, points[..., :1], 1)):  # fmt: skip
         refused("expected a picture", compiled.read, *wrong)
+    for empty in (picture[:0], picture[:, :0], picture[..., :0]):
+        refused("1 to 2\\^24 rows", compiled.read, empty, points, 1)
     with pytest.raises(TypeError):
-        compiled.read(picture.astype(np.int16), x, x, 1)
+        compiled.read(picture.astype(np.int16), points, 1)

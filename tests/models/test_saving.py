@@ -1,5 +1,4 @@
 import json
-import math
 
 import pytest
 import torch
@@ -124,41 +123,3 @@ def test_a_card_keeps_the_whole_view(tmp_path):
         ModelCard("swin_nano", dict(view=MercatorView((32, 32))))
     with pytest.raises(ValueError, match="mean is an option of the model and of its view"):
         ModelCard("swin_nano", dict(view=view, mean=0.5))
-
-
-CIRCLE = dict(name="perspective", reach=1.0, theta_max=1.0, supersampling=1)
-WHOLE = dict(CIRCLE, reach=math.radians(87.5), theta_max=math.radians(87.5))
-
-
-@pytest.mark.parametrize(("model", "options", "new", "view"), [
-    ("swin_undis_nano", {}, "swin_nano", WHOLE),
-    ("swin_undis_nano", dict(max_fov=2.0), "swin_nano", CIRCLE),
-    ("swin_nano", dict(view="perspective", max_fov=None), "swin_nano", WHOLE),
-    ("swin_nano", dict(view="tangent", fov=1.2), "swin_nano", dict(name="perspective", fov=1.2)),
-    ("swin_nano", dict(view="none"), "swin_nano", "none"),
-    ("dat_nano", dict(view="square", theta_max=1.2), "dat_nano", dict(name="square", fov=2.4)),
-    ("swin_unet_undis_nano", dict(task="distance"), "swin_unet_nano", WHOLE),
-    ("swin_unet_adapted_nano", dict(spacing="g"), "swin_unet_nano",
-     dict(name="square", spacing="g")),
-    ("conv_unet_nano", dict(view="mercator", size=[36, 28], fov=2.6), "conv_unet_nano",
-     dict(name="mercator", size=[36, 28], fov=2.6)),
-    ("darswin_unet_a_nano", dict(view="polar", spacing="g"), "darswin_unet_a_nano", "polar"),
-    ("swin_undis_nano", dict(max_fov="x"), "swin_nano", None),
-])  # fmt: skip
-def test_a_file_of_before_the_views_had_their_options_is_read_or_refused(
-    model, options, new, view, tmp_path
-):
-    path, keeps = tmp_path / "m.safetensors", dict(num_classes=3)
-    keeps |= {name: options[name] for name in ("task",) if name in options}
-    keeps |= dict(spacing="g") if view == "polar" else {}
-    made = create_model(new, **keeps, **({} if view in (None, "polar") else dict(view=view)))
-    card = dict(classes=[], size=64, fov=2.0, fit="stretch", task="classification", colors=[])
-    entry = json.dumps(card | dict(model=model, options=keeps | options, quantized={}))
-    weights = {name: tensor.contiguous() for name, tensor in made.state_dict().items()}
-    save_file(weights, path, metadata={"darswin": entry})
-    if view is None:
-        assert "its options {" in refusal(path)
-        return
-    loaded, card = load_model(path)
-    assert (card.model, card.options.pop("view")) == (new, view) and card.options == keeps
-    assert loaded.view.made == made.view.made and type(loaded) is type(made)

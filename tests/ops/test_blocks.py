@@ -10,10 +10,9 @@ from torch import nn
 
 from darswin.deploy.own import norm_parameters, packed_weights
 from darswin.deploy.packed import OwnBlocks
-from darswin.deploy.program import BLOCK, DEFORM, Checked, Program, Weights
+from darswin.deploy.program import BLOCK, Checked, Program, Weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block, Mlp
-from darswin.models.dat import DeformableAttention
 from darswin.ops import use_reference
 
 _OPS = torch.ops.darswin
@@ -123,26 +122,18 @@ def test_linear_behind_a_norm():
         _linear(x, weights, 50, False, parameters[:, :36])
 
 
-def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3, groups=0):
-    """Blocks; with groups, all but the second have deformable attention."""
+def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3):
     torch.manual_seed(0)
     blocks = []
     for index in range(depth):
-        if groups and index != 1:
-            attn = DeformableAttention(
-                dim, heads, map_size=map_size, groups=groups, kernel=7 - 2 * index,
-                offset_range=1.0 + 4 * index,
-            )  # fmt: skip
-            nn.init.normal_(attn.offset.weight)
-        else:
-            attn = WindowAttention(
-                dim,
-                heads,
-                map_size=map_size,
-                window=window,
-                shift=(window[0] // 2, window[1] // 2) if index % 2 else (0, 0),
-                periodic=(False, index > 0),
-            )
+        attn = WindowAttention(
+            dim,
+            heads,
+            map_size=map_size,
+            window=window,
+            shift=(window[0] // 2, window[1] // 2) if index % 2 else (0, 0),
+            periodic=(False, index > 0),
+        )
         nn.init.normal_(attn.position_bias.table)
         blocks.append(Block(dim, attn, mlp_ratio=2.5))
         for norm in blocks[-1].modules():
@@ -156,11 +147,6 @@ WINDOWS = [
     dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)),
     dict(dim=64, heads=2, depth=1),
 ]
-DEFORMABLE = [
-    dict(groups=3), dict(dim=40, heads=4, map_size=(6, 9), window=(3, 3), groups=2),
-    dict(dim=10, heads=2, map_size=(1, 6), window=(1, 3), groups=1),
-    dict(dim=3, heads=1, map_size=(1, 1), window=(1, 1), groups=1),
-]  # fmt: skip
 
 
 def run(blocks, x):
@@ -170,7 +156,7 @@ def run(blocks, x):
 
 
 @pytest.mark.parametrize("batch", [0, 1, 3])
-@pytest.mark.parametrize("sizes", [*WINDOWS, *DEFORMABLE], ids=str)
+@pytest.mark.parametrize("sizes", WINDOWS, ids=str)
 def test_blocks_are_those_of_the_layers(batch, sizes):
     blocks = stage(**sizes)
     map_size, dim = blocks[0].attn.map_size, blocks[0].attn.dim
@@ -207,13 +193,10 @@ def test_same_bits_on_any_number_of_threads():
     x, rows = torch.randn(4, 16, 32, 48), torch.randn(100, 700)
     tables = [block.attn.position_bias().contiguous() for block in blocks]
     packed, weights = OwnBlocks(blocks, Weights()), packed_weights(linear)
-    deformable = stage(dim=48, map_size=(8, 16), groups=3)
-    moved = OwnBlocks(deformable, Weights())
-    biases = [block.attn.position_bias().contiguous() for block in deformable]
     assert_same_bits_on_any_number_of_threads(
         lambda: dict(
-            blocks=packed(x.clone(), tables), moved=moved(x[:, :8, :16].contiguous(), biases),
-            linear=_linear(rows, weights, 500, True), few=_linear(rows[:3], weights, 500, False),
+            blocks=packed(x.clone(), tables), linear=_linear(rows, weights, 500, True),
+            few=_linear(rows[:3], weights, 500, False),
         ),
         (1, 2, 5),
     )  # fmt: skip
@@ -256,43 +239,20 @@ def test_wrong_arguments():
             _linear(x, packed, columns, False)
 
 
-def test_numbers_that_are_not_finite_move_points_nowhere():
-    blocks, x = stage(depth=1, groups=3), torch.randn(3, 8, 16, 24)
-    tables, moved = [blocks[0].attn.position_bias()], OwnBlocks(blocks, Weights())
-    clean = moved(x.clone(), tables)
-    x[0, 3, 4], x[2, 5, :, 7] = math.nan, math.inf
-    got = moved(x, tables)
-    assert got[0, 3, 4].isnan().all() and got[2, 5].isnan().all()
-    assert torch.equal(got[1], clean[1])
-    endless = blocks[0].attn
-    endless.offset_range = math.inf  # tanh(0) times this is NaN
-    nn.init.zeros_(endless.offset.weight)
-    assert OwnBlocks(blocks, Weights())(torch.zeros(1, 8, 16, 24), tables).isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("groups", "opcode", "more"),
-    [
-        (0, BLOCK, {16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,)}),
-        (3, DEFORM, {8: (1,), 16: (4, 0), 17: (8,), 18: (1, -1), 19: (1,), 23: (0, -1, 2, 2**40),
-                     24: (0, -1, 2, 4, 2**20 + 1, 2**40),
-                     **dict.fromkeys(range(26, 30), (-1, 10**9))}),
-    ],
-)  # fmt: skip
-def test_blocks_that_do_not_fit(groups, opcode, more):
-    blocks = OwnBlocks(stage(depth=1, groups=groups), Weights())
+def test_blocks_that_do_not_fit():
+    blocks = OwnBlocks(stage(depth=1), Weights())
     table, x = torch.zeros(1, *blocks.table_shapes[0]), torch.zeros(1, *blocks.map_shape)
     blocks(x, [table])
     words, weights = blocks.written.words(), blocks.written.weights.words
     run = Checked(weights, words)
-    count = 30 if groups else 23
-    assert words[-count - 2] == opcode and (blocks.heads, blocks.mlp_dim) == (3, 60)
+    assert words[-25] == BLOCK and (blocks.heads, blocks.mlp_dim) == (3, 60)
     wrong = {1: (9, 0), 2: (0,), 3: (20,), 4: (0, -3, 5), 5: (0, 2**61), 6: (-1, 2**40),
-             7: (-1, weights.numel()), 8: (2,), 22: (0, 2), **more}  # fmt: skip
+             7: (-1, weights.numel()), 8: (2,), 16: (0, 3), 17: (7,), 18: (8, -1), 19: (16,),
+             22: (0, 2)}  # fmt: skip
     for place, values in wrong.items():
         for value in values:
             changed = [*words]
-            changed[place - count] = value
+            changed[place - 23] = value
             with pytest.raises(ValueError, match="the program of a network"):
                 Checked(weights, changed)
     for given in ([x], [x[..., :20], table], [x, table[:, :2]], [x.transpose(1, 2)[:, :1], table]):
