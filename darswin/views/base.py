@@ -150,8 +150,14 @@ class View(nn.Module):
         self.mean, self.std = mean, std
 
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        """The same view for these N lenses alone, which finds once what it covers."""
+        """The same view for these N lenses alone, with what takes long to compute of them."""
         return self
+
+    def _with(self, **values: Any) -> Self:
+        """The same view with these attributes. Dynamo cannot trace `copy.copy` of a module."""
+        view = object.__new__(type(self))
+        view.__dict__.update(self.__dict__, **values)
+        return view
 
     def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> Any:
         """Everything of N lenses that `see` and `back` need, a `PreparedPixels` or `PreparedPolar`.

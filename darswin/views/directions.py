@@ -1,6 +1,5 @@
 """Views whose pixels look along rays of the camera: maps of the sphere, upright if you know up."""
 
-import copy
 import math
 from typing import Self
 
@@ -85,7 +84,7 @@ class RayView(PixelView):
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
-        self._known: tuple[Tensor, Tensor] | None = None
+        self._fixed: tuple[Tensor, Tensor] | None = None  # `_layout`, `for_lens`
 
     @classmethod
     def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
@@ -98,12 +97,8 @@ class RayView(PixelView):
 
     @in_full_precision
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        if torch.compiler.is_dynamo_compiling():
-            return self  # as Dynamo cannot copy
         # What the view covers takes most of the time of `to_view`.
-        view = copy.copy(self)
-        view._known = self._layout(check_lens(lens, size), size)
-        return view
+        return self._with(_fixed=self._layout(check_lens(lens, size), size))
 
     def to_plane(self, rays: Tensor) -> Tensor:
         """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
@@ -199,8 +194,8 @@ class RayView(PixelView):
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
         1, 2)."""
-        if self._known is not None:
-            return self._known
+        if self._fixed is not None:
+            return self._fixed
         with no_gradients():
             return self._covered(lens.detach(), size)
 
