@@ -126,9 +126,9 @@ class RayView(PixelView):
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
         of its size: the inverse of `to_rays`. NaN where the view shows nothing, and for rays 0."""
-        given = (rays != 0).any(-1)
+        has_length = (rays != 0).any(-1)
         rays = F.normalize(rays, dim=-1)
-        return self._points(rays, given & self._shows(rays), lens, size)
+        return self._points(rays, has_length & self._shows(rays), lens, size)
 
     def _points(self, rays: Tensor, shown: Tensor, lens: Lens, size: Pair) -> Tensor:
         """`to_points` of unit vectors; NaN unless they are shown."""
@@ -211,8 +211,8 @@ class RayView(PixelView):
         begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
         ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
         goals = torch.stack(torch.broadcast_tensors(*ends), 1)
-        seen = self._seen_ends(lens, begins, goals, size)
-        left, right, upper, lower = *seen[:, :2, 0].unbind(1), *seen[:, 2:, 1].unbind(1)
+        limits = self._seen_ends(lens, begins, goals, size)
+        left, right, upper, lower = *limits[:, :2, 0].unbind(1), *limits[:, 2:, 1].unbind(1)
         if self.around:
             left, right = torch.full_like(left, -math.pi), torch.full_like(right, math.pi)
         step = (right - left) / self.size[1]
@@ -272,12 +272,12 @@ class RayView(PixelView):
 
     def extra_repr(self) -> str:
         shown = dict(fov=self.fov, theta_max=self.theta_max, supersampling=self.supersampling)
-        given = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
+        options = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
         for name, vector, usual in (("up", self.up, PICTURE_TOP),
                                     ("direction", self.direction, AXIS)):  # fmt: skip
             if vector != usual:
-                given.append(f"{name}=({', '.join(f'{x:.4g}' for x in vector)})")
-        return ", ".join([super().extra_repr(), *given])
+                options.append(f"{name}=({', '.join(f'{x:.4g}' for x in vector)})")
+        return ", ".join([super().extra_repr(), *options])
 
 
 def check_sees(points: Tensor, view: PixelView, lens: Lens, size: Pair) -> Tensor:

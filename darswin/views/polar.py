@@ -146,9 +146,9 @@ class PolarView(View):
         # The operator would normalize in float32, and it needs a mean.
         if dtype == torch.float64 or self.mean is None:
             images = self.floating(images, dtype)
-        seen = polar_sample(**self.arguments(images, prepared.grid), layout=self.layout)
+        samples = polar_sample(**self.arguments(images, prepared.grid), layout=self.layout)
         # The operator makes float32 of uint8. Pixels go to a network as they are, tokens do not.
-        return seen.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else seen
+        return samples.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else samples
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
         """The arguments with which `polar_sample` reads images (B, C, H, W) on a grid."""
@@ -189,19 +189,19 @@ class PolarView(View):
         )  # fmt: skip
         return pixels.permute(0, 3, 1, 2)
 
-    def check_seen(self, seen: Tensor, prepared: PreparedPolar, channels: int | None) -> Tensor:
+    def check_seen(self, sampled: Tensor, prepared: PreparedPolar, channels: int | None) -> Tensor:
         if self.in_pixels:
-            seen = check_seen_images(seen, self.map_size, channels)
+            sampled = check_seen_images(sampled, self.map_size, channels)
         else:
             assert channels is not None
             values = self.samples[0] * self.samples[1] * channels
             check_tensor(
-                "sampled", seen, (torch.float32, torch.float64, torch.bfloat16),
+                "sampled", sampled, (torch.float32, torch.float64, torch.bfloat16),
                 "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})",
                 (None, self.rings, self.sectors, values),
             )  # fmt: skip
-        check_count(prepared.grid.radii.shape[0], seen)
-        return seen
+        check_count(prepared.grid.radii.shape[0], sampled)
+        return sampled
 
     @property
     def map_size(self) -> Pair:
@@ -253,9 +253,9 @@ class PolarView(View):
             grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
         else:
             theta, direction = self._rays or pixel_rays(lens, image_size)
-            seen = ~theta.isnan()  # NaN would spread to the gradients
-            flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
-            points = torch.where(seen[..., None], flat, torch.nan)
+            known = ~theta.isnan()  # NaN would spread to the gradients
+            flat = lens.project(torch.where(known, theta, 0.0))[..., None] * direction
+            points = torch.where(known[..., None], flat, torch.nan)
             grid = PixelGrid(radii, r_max, points=points)
         # Plans of many lenses would take much memory. A graph has no plan, and must not ask for the
         # number of lenses, which may vary.

@@ -96,14 +96,14 @@ class SquareView(PixelView):
 
     def _pixels(self, lens: Lens, theta: Tensor, direction: Tensor) -> Tensor:
         """The inverse of `_rays`; NaN where θ is or is beyond the edge."""
-        seen = ~theta.isnan()  # NaN must not reach the gradients
+        inside = ~theta.isnan()  # NaN must not reach the gradients
         if self.theta_max is not None:
-            seen = seen & (theta <= self.theta_max)
+            inside = inside & (theta <= self.theta_max)
         first, last = self._ends(lens, theta.dim())
-        value = to_spacing(lens, torch.where(seen, theta, 0.0), self.spacing)
+        value = to_spacing(lens, torch.where(inside, theta, 0.0), self.spacing)
         square = disc_to_square(((value - first) / (last - first)).clamp(max=1), direction)
         pixels = ((square + 1) * self.size[0] - 1) / 2
-        return torch.where(seen[..., None], pixels, torch.nan)
+        return torch.where(inside[..., None], pixels, torch.nan)
 
     def _ends(self, lens: Lens, dim: int) -> tuple[Tensor, Tensor]:
         """The values of the spacing in the middle and at the edge, for `dim` dimensions."""
