@@ -246,8 +246,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-class _Seen:
-    """What a lens v sees: the plane through the camera that is closest, in px, to each curve.
+class _Planes:
+    """For a lens v, the plane through the camera that is closest, in px, to each curve.
 
     In units of TOLERANCE: miss, of the points; straightness: (C,), its mean square for each curve.
     normal: (C, 3), of the planes, with the signs of `like`. After `orient`, axes: three orthogonal
@@ -320,7 +320,7 @@ class _Seen:
             axes = u @ vh
         return axes
 
-    def orient(self, axes: dict[int, np.ndarray] | None = None) -> "_Seen":
+    def orient(self, axes: dict[int, np.ndarray] | None = None) -> "_Planes":
         """Itself with all attributes, from directions nearby or from the best."""
         counts, of = self.lines.counts, self.lines.of
         if axes is None:
@@ -338,10 +338,10 @@ class _Seen:
         self.cost = self.rows @ self.rows
         return self
 
-    def moved(self, step: np.ndarray | float) -> "_Seen":
-        return _Seen(self.lines, self.v + step, self.normal).orient(self.axes)
+    def moved(self, step: np.ndarray | float) -> "_Planes":
+        return _Planes(self.lines, self.v + step, self.normal).orient(self.axes)
 
-    def refined(self, steps: int = 30) -> "_Seen":
+    def refined(self, steps: int = 30) -> "_Planes":
         """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
         found, damping = self, 1e-3
         for _ in range(steps):
@@ -368,18 +368,18 @@ def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return apart**2 / (1 + apart**2 / counts)
 
 
-def _search(lines: _Lines) -> list[_Seen]:
+def _search(lines: _Lines) -> list[_Planes]:
     """The lenses that fit best, the best first."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
     shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
-    tried = [_Seen(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
+    tried = [_Planes(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
     near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
     shape = near.orient({}).refined()
     straight = shape.straightness < STRAIGHT**2
     _check(straight.sum())
     lines, starts = lines.some(straight), []
     for depth in DEPTHS:
-        starts.append(_Seen(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
+        starts.append(_Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
         if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
             break
     fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
@@ -388,6 +388,6 @@ def _search(lines: _Lines) -> list[_Seen]:
     fits = sorted(fits, key=_cost)[:LOWS]
     for _ in range(3):
         fits = [fit.refined(5) for fit in fits]
-        fits = [min(fit, _Seen(lines, fit.v).orient(), key=_cost) for fit in fits]
+        fits = [min(fit, _Planes(lines, fit.v).orient(), key=_cost) for fit in fits]
     least = min(map(_cost, fits))
     return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)

@@ -85,8 +85,8 @@ class Lens(LensInImage):
     def _validate(self) -> None:
         """Raises ValueError for parameters that are in range but invalid together."""
 
-    def _set_theta_max(self, wanted: Tensor | None, given: str = "theta_max") -> None:
-        """Checks and sets θ_max; None means `theta_limit`. Errors name what was given: "theta_max",
+    def _set_theta_max(self, wanted: Tensor | None, argument: str = "theta_max") -> None:
+        """Checks and sets θ_max; None means `theta_limit`. Errors name the argument: "theta_max",
         or "fov", which is twice as large."""
         limit = self.theta_limit
         if not bool((limit > 0).all()):
@@ -95,10 +95,10 @@ class Lens(LensInImage):
         self.theta_max = limit if wanted is None else wanted
         if wanted is None:
             return
-        times, kind = (2 if given == "fov" else 1), self.declared["theta_max"]
+        times, kind = (2 if argument == "fov" else 1), self.declared["theta_max"]
         if not kind.holds(wanted):
-            self._require(given, (wanted > 0) & wanted.isfinite(), kind.range, times * wanted)
-        if given == "fov":
+            self._require(argument, (wanted > 0) & wanted.isfinite(), kind.range, times * wanted)
+        if argument == "fov":
             wanted = self.theta_max = _without_rounding(wanted, limit)
         # A limit computed in another dtype differs by rounding; MARGIN is larger than that.
         slack = 1 + 2 * torch.finfo(limit.dtype).eps
@@ -111,7 +111,7 @@ class Lens(LensInImage):
                 last = times * exact.detach()[beyond][0].item()
                 end = f"where r of this {type(self).__name__} lens stops rising"
                 range_ = f"at most {last:.6f} rad ({math.degrees(last):.2f}°), {end}"
-                self._require(given, ~beyond, range_, times * wanted)
+                self._require(argument, ~beyond, range_, times * wanted)
         self.theta_max = torch.where(wanted > limit, limit, wanted)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:

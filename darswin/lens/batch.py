@@ -35,16 +35,16 @@ class LensBatch:
         own = {name: p for name, p in vars(cls).items() if isinstance(p, Parameter)}
         for name in own:
             delattr(cls, name)  # instance attributes without a class attribute are faster
-        found = own | {name: p for name, p in cls.declared.items() if name not in own}
-        cls.parameters = tuple(name for name, p in found.items() if not p.optional)
+        declared = own | {name: p for name, p in cls.declared.items() if name not in own}
+        cls.parameters = tuple(name for name, p in declared.items() if not p.optional)
         cls.optional = tuple(
-            name for name, p in found.items() if p.optional and name not in cls.common
+            name for name, p in declared.items() if p.optional and name not in cls.common
         )
         others = (*cls.optional, *cls.common)
         cls.names = (*cls.parameters, *others)
-        cls.declared = {name: found[name] for name in cls.names}
-        by_place = [name for name in others if found[name].by_place]
-        by_name = [name for name in others if not found[name].by_place]
+        cls.declared = {name: declared[name] for name in cls.names}
+        by_place = [name for name in others if declared[name].by_place]
+        by_name = [name for name in others if not declared[name].by_place]
         cls._arguments = Arguments(cls.parameters, by_place, by_name)
         cls.__signature__ = cls._arguments.signature
         # torch.compile, torch.export and torch.func then see a lens as its tensors.
@@ -71,15 +71,15 @@ class LensBatch:
         super().__setattr__(name, value.contiguous() if isinstance(value, Tensor) else value)
 
     @classmethod
-    def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
+    def _rows(cls, values: Mapping[str, Number]) -> dict[str, Tensor]:
         """The values as tensors (N or 1, ...)."""
-        tensors = as_tensors(given).items()
+        tensors = as_tensors(values).items()
         return {name: cls.declared.get(name, NUMBER).rows(name, value) for name, value in tensors}
 
     @classmethod
-    def _expanded(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
+    def _expanded(cls, values: Mapping[str, Number]) -> dict[str, Tensor]:
         """`_rows`, expanded to N lenses."""
-        rows = cls._rows(given)
+        rows = cls._rows(values)
         sizes = {name: tensor.shape[0] for name, tensor in rows.items()}
         counts = {*sizes.values()} - {1} or {1}
         if len(counts) > 1:

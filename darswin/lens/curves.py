@@ -48,10 +48,8 @@ class Tabulated(Lens):
         if self.slopes is None:
             return
         if self.slopes.shape != self.angles.shape:
-            shape, given = tuple(self.angles.shape), tuple(self.slopes.shape)
-            raise ValueError(
-                f"slopes must have the shape of angles and radii, {shape}, got {given}"
-            )
+            shape, own = tuple(self.angles.shape), tuple(self.slopes.shape)
+            raise ValueError(f"slopes must have the shape of angles and radii, {shape}, got {own}")
         steepest = _steepest(self.angles, self.radii)
         rise = (self.slopes >= 0) & (self.slopes <= steepest)
         self._require("slopes", rise.all(1), "from 0 to 3 times the table's, so that r rises")

@@ -60,8 +60,8 @@ class DistortedLens(FocalLens, register=False):
     _plane_angle: ClassVar[Callable[..., Tensor]]
 
     @classmethod
-    def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
-        rows = super()._rows(given)
+    def _rows(cls, values: Mapping[str, Number]) -> dict[str, Tensor]:
+        rows = super()._rows(values)
         varied = [name for name, tensor in rows.items() if len(tensor) > 1]
         if varied == ["radial"] and rows["radial"].shape[1] == 1:  # a column, as in OpenCV
             count = len(rows["radial"])

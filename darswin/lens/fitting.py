@@ -78,12 +78,12 @@ def fit(
         return Fit(curves, largest_distance(curves, lens))
     terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
-    found = cat([fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
-    fitted = model(**found | {name: getattr(exact, name) for name in exact.common})
+    parameters = cat([fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
+    fitted = model(**parameters | {name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
 
-class _Seen(NamedTuple):
+class _Samples(NamedTuple):
     """Rays, θ (K,) and (cos φ, sin φ), (K, 2), with their pixels (K, 2) and weights (K,)."""
 
     theta: Tensor
@@ -118,10 +118,10 @@ class _Seen(NamedTuple):
             rows = torch.cat((rows, torch.eye(2).to(rows).expand(len(rows), 2, 2)), -1)
             both = weight.sqrt()[:, None, None] * torch.cat((rows, self.pixels[..., None]), -1)
             *left, right = both.flatten(0, 1).split((terms + 2, 1), 1)
-            found = torch.linalg.lstsq(*left, right).solution[:, 0]
-            weight = self.weight * self.trust((rows @ found - self.pixels).norm(dim=-1))
-        if found[0] > 0:
-            lens = KannalaBrandt(found[0], found[1:-2] / found[0], center=found[-2:])
+            solution = torch.linalg.lstsq(*left, right).solution[:, 0]
+            weight = self.weight * self.trust((rows @ solution - self.pixels).norm(dim=-1))
+        if solution[0] > 0:
+            lens = KannalaBrandt(solution[0], solution[1:-2] / solution[0], center=solution[-2:])
             if self.median(self.distance(lens)) < WILD * self.pixels.amax():
                 return lens
         raise ValueError("no lens has these rays: x must be to the right, y down and z forward")
@@ -131,8 +131,8 @@ def _fit_field(
     model: type[Lens], field: Any, terms: int | None, weights: Any, size: tuple[int, int] | None
 ) -> Fit:
     """`fit` to a field of rays."""
-    given = as_tensor(field)
-    rays = given.detach().to("cpu", torch.float64)
+    field = as_tensor(field)
+    rays = field.detach().to("cpu", torch.float64)
     if rays.dim() != 3 or rays.shape[2] != 3:
         raise ValueError(f"a field of rays must be (h, w, 3), got {tuple(rays.shape)}")
     sides = tuple(rays.shape[:2])
@@ -150,11 +150,11 @@ def _fit_field(
     across, ahead = rays[known].split((2, 1), 1)
     aside = length_of(across)
     theta, weight = torch.atan2(aside, ahead[:, 0]), weight.to(rays)[known]
-    seen = _Seen(theta, across / aside[:, None], pixels, weight)
-    some = _Seen(*(part[:: math.ceil(count / ENOUGH)] for part in seen))
+    samples = _Samples(theta, across / aside[:, None], pixels, weight)
+    some = _Samples(*(part[:: math.ceil(count / ENOUGH)] for part in samples))
     lens: Lens = some.curve()
     # The picture may show more than the lens: rays that are far off do not say where it ends.
-    near = seen.pixels[seen.trust(seen.distance(lens)) > 0.1]
+    near = samples.pixels[samples.trust(samples.distance(lens)) > 0.1]
     theta = lens.unproject_pixels(near)[0].nan_to_num(lens.theta_max.item())
     theta_max = torch.minimum(theta.max(), lens.theta_max)
     lens = lens.with_theta_max(theta_max)
@@ -173,16 +173,16 @@ def _fit_field(
             start = lens._tensors()
         lens = model(**start | {"theta_max": None})
         lens = lens.with_theta_max(torch.minimum(theta_max, lens.theta_max))
-    dtype = given.dtype if given.dtype == torch.float64 else torch.float32
+    dtype = field.dtype if field.dtype == torch.float64 else torch.float32
     lens = lens.replace(image_size=picture[None])
-    return Fit(lens.to(dtype), seen.median(seen.distance(lens)).to(dtype))
+    return Fit(lens.to(dtype), samples.median(samples.distance(lens)).to(dtype))
 
 
 def largest_distance(lens: Lens, other: Lens) -> Tensor:
     """(N,) px: the largest distance between the pixels of a ray in two lenses with one center."""
     theta, direction = _rays(other, 1024, 72)
-    one, two = (each.through_affine(each._flat(theta, direction)) for each in (lens, other))
-    return (one - two).norm(dim=-1).flatten(1).amax(1)
+    pixels, others = (each.through_affine(each._flat(theta, direction)) for each in (lens, other))
+    return (pixels - others).norm(dim=-1).flatten(1).amax(1)
 
 
 def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
@@ -205,11 +205,11 @@ def fit_one(model: type[Lens], lens: Lens, terms: int, rounds: int = ROUNDS) -> 
         coefficients = model.closest(line[0], radius[0], slope[0], terms)
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
-    found = (
+    fits = (
         _least_squares(model, start, lens.theta_max, theta, direction, goal, 1.0, rounds)
         for start in _starts(model, lens, terms, aside)
     )
-    best, cost = min(found, key=lambda pair: pair[1])
+    best, cost = min(fits, key=lambda pair: pair[1])
     if not math.isfinite(cost):
         degrees = math.degrees(lens.theta_max.item())
         raise ValueError(f"no {model.__name__} lens was found that reaches {degrees:.2f}°")

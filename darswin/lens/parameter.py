@@ -52,11 +52,11 @@ class Parameter:
         rows = value[None] if value.dim() == len(self.shape) else value
         sides = rows.shape[1:]
         if rows.dim() != len(self.shape) + 1 or any(
-            side is not None and side != given
-            for side, given in zip(self.shape, sides, strict=True)
+            side is not None and side != length
+            for side, length in zip(self.shape, sides, strict=True)
         ):
-            one = ", ".join("K" if side is None else str(side) for side in self.shape)
-            form = f"({one}) or (N, {one})" if one else "a number or (N,)"
+            lengths = ", ".join("K" if side is None else str(side) for side in self.shape)
+            form = f"({lengths}) or (N, {lengths})" if lengths else "a number or (N,)"
             raise ValueError(f"{name} must be {form}, got shape {tuple(value.shape)}")
         return rows
 
@@ -101,22 +101,22 @@ class Arguments:
         self, function: str, arguments: Sequence[Any], named: dict[str, Any]
     ) -> dict[str, Any]:
         """The values that are not None, by name; TypeError for wrong arguments."""
-        given = dict(zip(self.positional, arguments, strict=False)) | named
-        all_bound = len(given) == len(arguments) + len(named)
-        if not (all_bound and self.required <= given.keys() <= self.known):
+        bound = dict(zip(self.positional, arguments, strict=False)) | named
+        all_bound = len(bound) == len(arguments) + len(named)
+        if not (all_bound and self.required <= bound.keys() <= self.known):
             try:
                 self.signature.bind(*arguments, **named)  # its error describes the mistake
             except TypeError as error:
                 raise TypeError(f"{function}{self.signature}: {error}") from error
-        return {name: value for name, value in given.items() if value is not None}
+        return {name: value for name, value in bound.items() if value is not None}
 
 
 def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:
     """All values as tensors of one dtype and device, which the tensors among them determine."""
-    given = [v for v in values.values() if isinstance(v, Tensor) and v.is_floating_point()]
-    dtypes = (tensor.dtype for tensor in given)
-    dtype = reduce(torch.promote_types, dtypes) if given else torch.get_default_dtype()
-    device = given[0].device if given else None
+    floats = [v for v in values.values() if isinstance(v, Tensor) and v.is_floating_point()]
+    dtypes = (tensor.dtype for tensor in floats)
+    dtype = reduce(torch.promote_types, dtypes) if floats else torch.get_default_dtype()
+    device = floats[0].device if floats else None
     tensors = {}
     for name, value in values.items():
         try:

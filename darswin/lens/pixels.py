@@ -61,9 +61,9 @@ def solid_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
     """
     exact = lens.detach().to(torch.float64)
     theta, direction = pixel_rays(exact, size)
-    seen = ~theta.isnan()
+    known = ~theta.isnan()
     # In the plane θ (cos φ, sin φ), dΩ = sin θ / θ dp, also on the axis.
-    plane = torch.where(seen, theta, 0.0)[..., None] * torch.nan_to_num(direction)
+    plane = torch.where(known, theta, 0.0)[..., None] * torch.nan_to_num(direction)
 
     def place(point: Tensor) -> Tensor:
         angle = length_of(point)
@@ -75,7 +75,7 @@ def solid_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
     ]
     pixels_per_plane = determinant(torch.stack(columns, -1)).abs()
     area = torch.sinc(length_of(plane) / torch.pi) / pixels_per_plane
-    return torch.where(seen, area, 0.0).to(lens.theta_max.dtype)
+    return torch.where(known, area, 0.0).to(lens.theta_max.dtype)
 
 
 def distance_to_z(distance: Tensor, lens: Lens) -> Tensor:

@@ -58,25 +58,25 @@ def _doubt(
     """That of one lens; radius: of the image circle, px; scale: px per rad at the axis."""
     (height, width), (x, y) = size, center
     half, degrees = math.hypot(width, height) / 2, math.degrees(theta_max)
-    found = []
+    oddities = []
     if 2 * radius < SMALLEST_CIRCLE * min(size):
-        found.append(f"an image circle of {2 * radius:.3g} px up to θ_max = {degrees:.4g}°")
+        oddities.append(f"an image circle of {2 * radius:.3g} px up to θ_max = {degrees:.4g}°")
     elif half > LARGEST_SPAN * scale or (is_pinhole and theta_max > WIDEST_PINHOLE):
-        found.append(f"{scale * math.pi / 180:.3g} px per degree and a θ_max of {degrees:.4g}°")
+        oddities.append(f"{scale * math.pi / 180:.3g} px per degree and a θ_max of {degrees:.4g}°")
     elif half < SMALLEST_SPAN * scale or radius > LARGEST_RADIUS * half:
-        found.append(f"an image circle of {2 * radius:.6g} px up to θ_max = {degrees:.3g}°")
+        oddities.append(f"an image circle of {2 * radius:.6g} px up to θ_max = {degrees:.3g}°")
     off = _off_axes(x, y, width, height)
     swapped = min(off) > NEAR / 2 and swap_fits(x, y, width, height)
     far = min(off) > FAR_ON_BOTH and (
-        bool(found) or theta_max < LEAST_CIRCULAR
+        bool(oddities) or theta_max < LEAST_CIRCULAR
         or min(_shown(x, radius, width), _shown(y, radius, height)) < SHOWN
     )  # fmt: skip
     if far or max(off) > FAR_ON_ONE or swapped:
-        found.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
-    if not found:
+        oddities.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
+    if not oddities:
         return ""
     guess = _guess(x, y, width, height, min(max(scale, 1e-99), 1e99))
-    return f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(found)}{guess}"
+    return f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(oddities)}{guess}"
 
 
 def off_middle(x: float, y: float, width: float, height: float) -> float:

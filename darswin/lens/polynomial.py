@@ -148,8 +148,8 @@ class OCamInverse(PolynomialLens):
     Source: the OCamCalib toolbox, world2cam.
     """
 
-    def _set_theta_max(self, wanted: Tensor | None, given: str = "theta_max") -> None:
-        super()._set_theta_max(wanted, given)
+    def _set_theta_max(self, wanted: Tensor | None, argument: str = "theta_max") -> None:
+        super()._set_theta_max(wanted, argument)
         self._require("coefficients", self.r_max > 0, "such that r at theta_max is above 0")
 
     def _slope(self, theta: Tensor) -> Tensor:

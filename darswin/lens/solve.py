@@ -161,16 +161,16 @@ def newton(
         return repeated(
             partial(nearer, goal), lambda *state: going(goal, *state[2:]), state, rounds
         )[0]
-    found, indices = point.clone(), torch.arange(len(point))
+    points, indices = point.clone(), torch.arange(len(point))
     for _ in range(rounds):
         state = nearer(goal, *state)
-        found[indices] = state[0]
+        points[indices] = state[0]
         left = going(goal, *state[2:])
         if not left.any():
             break
         indices, goal = indices[left], goal[left]
         state = tuple(x[left] for x in state)
-    return found
+    return points
 
 
 def length_of(points: Tensor) -> Tensor:

@@ -46,19 +46,76 @@ def check_fixed_theta_max(theta_max: float, *spacings: Spacing) -> None:
             raise ValueError(f"a fixed theta_max needs spacing='theta', got {spacing!r}")
 
 
+class Rings:
+    """The rings of N lenses, equal steps of a spacing from θ = 0 on, and points inside them.
+
+    Args:
+        lens: N lenses. rings: R.
+        steps: the points inside a ring, (S,), as fractions of it.
+        spacing: of the borders. inner: of the points.
+        theta_max: θ of the last border, rad, with the spacings "theta"; None means θ_max of each
+            lens. Beyond θ_max of a lens, r rises in proportion to θ.
+
+    Raises:
+        ValueError: a spacing is "tan" and a lens has θ_max ≥ 90°.
+    """
+
+    def __init__(
+        self, lens: Lens, rings: int, steps: Tensor, spacing: Spacing, inner: Spacing,
+        theta_max: float | None,
+    ):  # fmt: skip
+        self._lens, self._spacing, self._inner, self._end = lens, spacing, inner, theta_max
+        if inner == "tan":
+            check_tan(lens)
+        first, last = span(lens, spacing)
+        if theta_max is not None:
+            last = torch.full_like(last, theta_max)
+        fractions = torch.linspace(0, 1, rings + 1, dtype=steps.dtype, device=steps.device)
+        self._borders = first + (last - first) * fractions
+        edges = self._borders
+        if inner != spacing:
+            edges = to_spacing(lens, to_theta(lens, edges, spacing), inner)
+        begin, end = edges[:, :-1, None], edges[:, 1:, None]
+        self._points = (begin + (end - begin) * steps).flatten(1)
+
+    @property
+    def borders(self) -> Tensor:
+        """r of the borders, (N, R+1) px."""
+        return self._radii(self._borders, self._spacing)
+
+    @property
+    def border_angles(self) -> Tensor:
+        """θ of the borders, (N, R+1) rad."""
+        return to_theta(self._lens, self._borders, self._spacing)
+
+    @property
+    def radii(self) -> Tensor:
+        """r of the points, (N, R·S) px."""
+        return self._radii(self._points, self._inner)
+
+    @property
+    def angles(self) -> Tensor:
+        """θ of the points, (N, R·S) rad."""
+        return to_theta(self._lens, self._points, self._inner)
+
+    def _radii(self, values: Tensor, spacing: Spacing) -> Tensor:
+        lens = self._lens
+        if spacing == "radius":
+            return values
+        theta = to_theta(lens, values, spacing)
+        if self._end is None:
+            return lens.project(theta)
+        last = lens.theta_max[:, None]
+        beyond = (theta - last).clamp(min=0) * (lens.r_max[:, None] / last)
+        return lens.project(torch.minimum(theta, last)) + beyond
+
+
 def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
     """The values of a spacing at θ = 0 and θ_max, (N, 1) each. Raises the errors of `check_tan`."""
     if spacing == "tan":
         check_tan(lens)
     last = lens.theta_max[:, None]
     return to_spacing(lens, torch.zeros_like(last), spacing), to_spacing(lens, last, spacing)
-
-
-def change_spacing(lens: Lens, value: Tensor, source: Spacing, target: Spacing) -> Tensor:
-    """Converts values (N, ...) of one spacing to another."""
-    if source == target:
-        return value
-    return to_spacing(lens, to_theta(lens, value, source), target)
 
 
 def to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:

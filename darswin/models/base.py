@@ -103,7 +103,9 @@ class Model(nn.Module, Generic[Result]):
             TypeError: the lens is missing, and the model uses one.
             ValueError: the lens belongs to images of another size.
         """
-        view = self.view.for_lens(lens, size)
+        view = self.view
+        if self.goes_back or self.reads_rays:
+            view = view.for_lens(lens, size)
         prepared = view.prepare(lens, size, back=self.goes_back)
         return Prepared(
             prepared,

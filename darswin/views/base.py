@@ -150,8 +150,14 @@ class View(nn.Module):
         self.mean, self.std = mean, std
 
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        """The same view for these N lenses alone, which finds once what it covers."""
+        """The same view for these N lenses alone, with what takes long to compute of them."""
         return self
+
+    def _with(self, **values: Any) -> Self:
+        """The same view with these attributes. Dynamo cannot trace `copy.copy` of a module."""
+        view = object.__new__(type(self))
+        view.__dict__.update(self.__dict__, **values)
+        return view
 
     def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> Any:
         """Everything of N lenses that `see` and `back` need, a `PreparedPixels` or `PreparedPolar`.
@@ -196,7 +202,7 @@ class View(nn.Module):
         """
         raise NotImplementedError
 
-    def check_seen(self, seen: Tensor, prepared: Any, channels: int | None) -> Tensor:
+    def check_seen(self, sampled: Tensor, prepared: Any, channels: int | None) -> Tensor:
         """The result of `see` for images with C channels; TypeError or ValueError otherwise."""
         raise NotImplementedError
 
@@ -244,16 +250,17 @@ def check_images(
     return channels_first("images", images, channels_last, channels)
 
 
-def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
+def check_seen_images(sampled: Tensor, size: Pair, channels: int | None) -> Tensor:
     """What a view of (H, W) pixels sees, as (B, C, H, W); TypeError or ValueError otherwise."""
-    seen = check_images(seen, channels=channels)
-    if channels is not None and seen.shape[1] != channels:
-        raise ValueError(f"sampled must have {channels} channels, got {seen.shape[1]}")
-    if seen.shape[2:] != size:
+    sampled = check_images(sampled, channels=channels)
+    if channels is not None and sampled.shape[1] != channels:
+        raise ValueError(f"sampled must have {channels} channels, got {sampled.shape[1]}")
+    if sampled.shape[2:] != size:
         raise ValueError(
-            f"sampled must have the size of the view, (H, W) = {size}, got {tuple(seen.shape[2:])}"
+            f"sampled must have the size of the view, (H, W) = {size}, "
+            f"got {tuple(sampled.shape[2:])}"
         )
-    return seen
+    return sampled
 
 
 def size_of(view: View) -> Pair | None:

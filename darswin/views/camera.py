@@ -132,10 +132,10 @@ class CameraView(PixelView):
         index = whole.astype(np.intp)
 
         def at(table: np.ndarray) -> np.ndarray:
-            found = table[1].take(index, mode="clip")
-            found *= share
-            found += table[0].take(index, mode="clip")
-            return found
+            values = table[1].take(index, mode="clip")
+            values *= share
+            values += table[0].take(index, mode="clip")
+            return values
 
         ratio = at(ratios)
         if angles is not None:

@@ -112,8 +112,8 @@ class CropView(PixelView):
         """`_matrix` of N lenses for points (N, ..., 2): (N, 2, 2), and (N, …, 2)."""
         # Without a rotation, it is the same for all lenses, and the graph may not know how many.
         each = [lens[k] for k in range(len(lens))] if self.turn.angle else [lens]
-        found = np.array([self._matrix(one, size) for one in each]).reshape(-1, 2, 3)
-        matrix = torch.from_numpy(found).to(like.device, like.dtype)
+        matrices = np.array([self._matrix(of_lens, size) for of_lens in each]).reshape(-1, 2, 3)
+        matrix = torch.from_numpy(matrices).to(like.device, like.dtype)
         return matrix[..., :2], matrix[..., 2].reshape(len(each), *(1,) * (like.dim() - 2), 2)
 
     # -- of one lens ----------------------------------------------------------------------------
@@ -132,13 +132,13 @@ class CropView(PixelView):
         if self.turn.angle:
             whole = CropView(self.part, (height, width), self.turn)
             onto = whole._matrix(remap.some_lens, remap.size)
-            found = area_resized(cv2.warpAffine(picture, onto, (width, height)), self.size)
+            resized = area_resized(cv2.warpAffine(picture, onto, (width, height)), self.size)
         else:
             if self.turn.mirrored:
                 left = picture.shape[1] - left - width
-            found = area_resized(picture[top : top + height, left : left + width], self.size)
-            found = found[:, ::-1] if self.turn.mirrored else found
-        return np.ascontiguousarray(found).reshape(*self.size, *picture.shape[2:])
+            resized = area_resized(picture[top : top + height, left : left + width], self.size)
+            resized = resized[:, ::-1] if self.turn.mirrored else resized
+        return np.ascontiguousarray(resized).reshape(*self.size, *picture.shape[2:])
 
     def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
         supersampling = self.supersampling_of(lens, size)

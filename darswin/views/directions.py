@@ -1,6 +1,5 @@
 """Views whose pixels look along rays of the camera: maps of the sphere, upright if you know up."""
 
-import copy
 import math
 from typing import Self
 
@@ -85,7 +84,7 @@ class RayView(PixelView):
         self.up = unit_vector("up", PICTURE_TOP if up is None else up)
         self.direction = unit_vector("direction", AXIS if direction is None else direction)
         self._frame = frame_of(self.up, self.direction, self.upright)
-        self._known: tuple[Tensor, Tensor] | None = None
+        self._fixed: tuple[Tensor, Tensor] | None = None  # `_layout`, `for_lens`
 
     @classmethod
     def usual_shape(cls, lens: Lens, size: Pair, fov: float | None = None) -> tuple[float, float]:
@@ -98,12 +97,8 @@ class RayView(PixelView):
 
     @in_full_precision
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        if torch.compiler.is_dynamo_compiling():
-            return self  # as Dynamo cannot copy
         # What the view covers takes most of the time of `to_view`.
-        view = copy.copy(self)
-        view._known = self._layout(check_lens(lens, size), size)
-        return view
+        return self._with(_fixed=self._layout(check_lens(lens, size), size))
 
     def to_plane(self, rays: Tensor) -> Tensor:
         """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
@@ -131,9 +126,9 @@ class RayView(PixelView):
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Rays (N or 1, ..., 3), of any length, → pixels (N or 1, ..., 2) of the view, also outside
         of its size: the inverse of `to_rays`. NaN where the view shows nothing, and for rays 0."""
-        given = (rays != 0).any(-1)
+        has_length = (rays != 0).any(-1)
         rays = F.normalize(rays, dim=-1)
-        return self._points(rays, given & self._shows(rays), lens, size)
+        return self._points(rays, has_length & self._shows(rays), lens, size)
 
     def _points(self, rays: Tensor, shown: Tensor, lens: Lens, size: Pair) -> Tensor:
         """`to_points` of unit vectors; NaN unless they are shown."""
@@ -199,8 +194,8 @@ class RayView(PixelView):
     def _layout(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         """The length of a pixel in the plane, (N or 1, 1), and the middle of the view there, (N or
         1, 2)."""
-        if self._known is not None:
-            return self._known
+        if self._fixed is not None:
+            return self._fixed
         with no_gradients():
             return self._covered(lens.detach(), size)
 
@@ -216,8 +211,8 @@ class RayView(PixelView):
         begins = torch.stack(torch.broadcast_tensors(row, row, start, start), 1)
         ends = (row - edge, row + edge, self._highest(start, -1), self._highest(start, 1))
         goals = torch.stack(torch.broadcast_tensors(*ends), 1)
-        seen = self._seen_ends(lens, begins, goals, size)
-        left, right, upper, lower = *seen[:, :2, 0].unbind(1), *seen[:, 2:, 1].unbind(1)
+        limits = self._seen_ends(lens, begins, goals, size)
+        left, right, upper, lower = *limits[:, :2, 0].unbind(1), *limits[:, 2:, 1].unbind(1)
         if self.around:
             left, right = torch.full_like(left, -math.pi), torch.full_like(right, math.pi)
         step = (right - left) / self.size[1]
@@ -277,12 +272,12 @@ class RayView(PixelView):
 
     def extra_repr(self) -> str:
         shown = dict(fov=self.fov, theta_max=self.theta_max, supersampling=self.supersampling)
-        given = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
+        options = [f"{name}={value:.4g}" for name, value in shown.items() if value is not None]
         for name, vector, usual in (("up", self.up, PICTURE_TOP),
                                     ("direction", self.direction, AXIS)):  # fmt: skip
             if vector != usual:
-                given.append(f"{name}=({', '.join(f'{x:.4g}' for x in vector)})")
-        return ", ".join([super().extra_repr(), *given])
+                options.append(f"{name}=({', '.join(f'{x:.4g}' for x in vector)})")
+        return ", ".join([super().extra_repr(), *options])
 
 
 def check_sees(points: Tensor, view: PixelView, lens: Lens, size: Pair) -> Tensor:

@@ -71,9 +71,9 @@ def _search(
     for _ in range(_STEPS):
         box, wide = _boxes_of(remap, state + change[:, None], height, radius, frame)
         wide = np.broadcast_to(wide[0], wide.shape)
-        found, goal = _numbers(box, wide), _numbers(table, wide[0])
-        gap = goal - found[0]
-        slopes = np.moveaxis(found[1:] - found[0], 0, -1) / _STEP
+        numbers, goal = _numbers(box, wide), _numbers(table, wide[0])
+        gap = goal - numbers[0]
+        slopes = np.moveaxis(numbers[1:] - numbers[0], 0, -1) / _STEP
         known = np.isfinite(slopes).all((1, 2)) & (np.abs(np.linalg.det(slopes)) > 0)
         state[~known] = np.nan
         if not known.any() or np.abs(gap[known]).max() < 0.01 * _NEAR:

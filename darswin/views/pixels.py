@@ -170,10 +170,10 @@ class PixelView(View):
         if prepared.points is None:
             return images
         check_count(prepared.points.shape[0], images)
-        seen = sample_at(images, prepared.points)
+        pixels = sample_at(images, prepared.points)
         assert self.size is not None
         supersampling = prepared.points.shape[2] // self.size[1]
-        return seen if supersampling == 1 else F.avg_pool2d(seen, supersampling)
+        return pixels if supersampling == 1 else F.avg_pool2d(pixels, supersampling)
 
     def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
         points = self.back_points(prepared, (maps.shape[2], maps.shape[3]))
@@ -206,11 +206,11 @@ class PixelView(View):
         """Points of a map, whose outermost pixels extend to its edges."""
         return torch.minimum(points.clamp(min=0), tensor_there(size[::-1], points) - 1)
 
-    def check_seen(self, seen: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
-        seen = check_seen_images(seen, self.size or prepared.size, channels)
+    def check_seen(self, sampled: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
+        sampled = check_seen_images(sampled, self.size or prepared.size, channels)
         if prepared.points is not None:
-            check_count(prepared.points.shape[0], seen)
-        return seen
+            check_count(prepared.points.shape[0], sampled)
+        return sampled
 
     def extra_repr(self) -> str:
         return f"size={self.size}"

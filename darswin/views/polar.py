@@ -4,7 +4,6 @@ back from a polar map to pixels.
 Rings and samples are equal steps of a *spacing*; see `darswin.lens.spacing`.
 """
 
-import copy
 import math
 from typing import Any, Literal, Self, get_args
 
@@ -14,15 +13,7 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays, ray_channels
 from darswin.lens.solve import direction_of, vector_of
-from darswin.lens.spacing import (
-    SPACINGS,
-    Spacing,
-    change_spacing,
-    check_fixed_theta_max,
-    check_tan,
-    span,
-    to_theta,
-)
+from darswin.lens.spacing import SPACINGS, Rings, Spacing, check_fixed_theta_max
 from darswin.ops import polar_sample, polar_to_image, polar_to_image_plan
 from darswin.ops.checks import as_int, check_jitter, check_layout, check_tensor
 from darswin.views.base import (
@@ -81,7 +72,7 @@ class PolarView(View):
 
     coordinates = 3  # the viewing direction of a token
 
-    _found: list[tuple[Tensor, Tensor]] | None = None  # by `_pixel_rays`
+    _rays: tuple[Tensor, Tensor] | None = None  # of the images' pixels, `for_lens`
 
     def __init__(
         self,
@@ -122,12 +113,10 @@ class PolarView(View):
         self.jitter = check_jitter(jitter)
         self.in_pixels = layout == "image"
 
+    @in_full_precision
     def for_lens(self, lens: Lens | None, size: Pair) -> Self:
-        if torch.compiler.is_dynamo_compiling():
-            return self  # as Dynamo cannot copy
-        view = copy.copy(self)
-        view._found = []
-        return view
+        lens = check_lens(lens, size)
+        return self if lens.is_radial else self._with(_rays=pixel_rays(lens, size))
 
     @in_full_precision
     def prepare(self, lens: Lens | None, size: Pair, *, back: bool | Pair = True) -> PreparedPolar:
@@ -143,14 +132,7 @@ class PolarView(View):
         lens = check_lens(lens, size)
         if self.in_pixels:
             return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
-        return ray_channels(*self._pixel_rays(lens, size))
-
-    def _pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
-        """`pixel_rays`, which takes long for a lens that is not radial: once for `for_lens`."""
-        found = [] if self._found is None else self._found
-        if not found:
-            found.append(pixel_rays(lens, size))
-        return found[0]
+        return ray_channels(*self._rays or pixel_rays(lens, size))
 
     @in_full_precision
     def token_positions(self, lens: Lens | None, size: Pair) -> Tensor:
@@ -164,9 +146,9 @@ class PolarView(View):
         # The operator would normalize in float32, and it needs a mean.
         if dtype == torch.float64 or self.mean is None:
             images = self.floating(images, dtype)
-        seen = polar_sample(**self.arguments(images, prepared.grid), layout=self.layout)
+        samples = polar_sample(**self.arguments(images, prepared.grid), layout=self.layout)
         # The operator makes float32 of uint8. Pixels go to a network as they are, tokens do not.
-        return seen.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else seen
+        return samples.to(dtype) if self.in_pixels and images.dtype == torch.uint8 else samples
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
         """The arguments with which `polar_sample` reads images (B, C, H, W) on a grid."""
@@ -207,19 +189,19 @@ class PolarView(View):
         )  # fmt: skip
         return pixels.permute(0, 3, 1, 2)
 
-    def check_seen(self, seen: Tensor, prepared: PreparedPolar, channels: int | None) -> Tensor:
+    def check_seen(self, sampled: Tensor, prepared: PreparedPolar, channels: int | None) -> Tensor:
         if self.in_pixels:
-            seen = check_seen_images(seen, self.map_size, channels)
+            sampled = check_seen_images(sampled, self.map_size, channels)
         else:
             assert channels is not None
             values = self.samples[0] * self.samples[1] * channels
             check_tensor(
-                "sampled", seen, (torch.float32, torch.float64, torch.bfloat16),
+                "sampled", sampled, (torch.float32, torch.float64, torch.bfloat16),
                 "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})",
                 (None, self.rings, self.sectors, values),
             )  # fmt: skip
-        check_count(prepared.grid.radii.shape[0], seen)
-        return seen
+        check_count(prepared.grid.radii.shape[0], sampled)
+        return sampled
 
     @property
     def map_size(self) -> Pair:
@@ -246,42 +228,34 @@ class PolarView(View):
             ValueError: the spacing is "tan" and a lens has θ_max ≥ 90°.
         """
         steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
-        borders, points = self._rings(lens, self.inner_spacing, steps_r)
-        sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
+        rings, last, offsets = self._rings(lens, steps_r), lens.theta_max, None
+        sector = torch.arange(self.sectors, dtype=steps_phi.dtype, device=steps_phi.device)[:, None]
         azimuths = (sector + steps_phi).flatten() * (2 * math.pi / self.sectors)
-        radii, offsets = self._radii(lens, points, self.inner_spacing), None
+        radii, center = rings.radii, lens.center_in(image_size)
+        if self.theta_max is not None:
+            radii = torch.where(rings.angles > last[:, None], torch.nan, radii)
+            last = torch.full_like(last, self.theta_max)
         if not lens.is_radial:
-            theta = to_theta(lens, points, self.inner_spacing)
+            theta = rings.angles
             if self.theta_max is not None:
                 theta = torch.minimum(theta, lens.theta_max[:, None])
             offsets = _offsets(lens, theta, azimuths)
-        if self.theta_max is not None:
-            radii = torch.where(points > lens.theta_max[:, None], torch.nan, radii)
-        return PolarGrid(
-            radii,
-            azimuths,
-            lens.center_in(image_size),
-            self._radii(lens, borders, self.spacing),
-            self.last_angle(lens),
-            lens.affine,
-            offsets,
-        )
+        return PolarGrid(radii, azimuths, center, rings.borders, last, lens.affine, offsets)
 
     def pixel_grid(self, lens: Lens, image_size: tuple[int, int], split: int = 1) -> PixelGrid:
         """The way back to images of (H, W) from a polar map with `split` rings per ring here."""
         steps = _steps(split, "centers", lens.theta_max)
-        _, centers = self._rings(lens, self.inner_spacing, steps)
-        radii, r_max = self._radii(lens, centers, self.inner_spacing), lens.r_max
+        radii, r_max = self._rings(lens, steps).radii, lens.r_max
         if self.theta_max is not None:
             end = lens.theta_max.clamp(max=self.theta_max)
             r_max = lens.project(end[:, None])[:, 0]
         if lens.is_radial:
             grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
         else:
-            theta, direction = self._pixel_rays(lens, image_size)
-            seen = ~theta.isnan()  # NaN would spread to the gradients
-            flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
-            points = torch.where(seen[..., None], flat, torch.nan)
+            theta, direction = self._rays or pixel_rays(lens, image_size)
+            known = ~theta.isnan()  # NaN would spread to the gradients
+            flat = lens.project(torch.where(known, theta, 0.0))[..., None] * direction
+            points = torch.where(known[..., None], flat, torch.nan)
             grid = PixelGrid(radii, r_max, points=points)
         # Plans of many lenses would take much memory. A graph has no plan, and must not ask for the
         # number of lenses, which may vary.
@@ -303,47 +277,20 @@ class PolarView(View):
         and its sector on the radial curve; other distortions of the lens are ignored.
         """
         rings, sectors = map_size or (self.rings, self.sectors)
-        _, centers = self._rings(lens, self.spacing, _steps(1, "centers", lens.theta_max), rings)
-        theta = change_spacing(lens, centers, self.spacing, "theta")[..., None]
+        center = _steps(1, "centers", lens.theta_max)
+        of_map = Rings(lens, rings, center, self.spacing, self.spacing, self.theta_max)
+        theta = of_map.angles[..., None]
         sector = torch.arange(sectors, dtype=theta.dtype, device=theta.device)
         azimuth = (sector + 0.5) * (2 * math.pi / sectors)
         return vector_of(theta.expand(-1, -1, sectors), direction_of(azimuth))
 
     def border_angles(self, lens: Lens) -> Tensor:
         """θ of the ring borders, (N, R+1) rad."""
-        borders, _ = self._rings(lens, self.spacing, lens.theta_max.new_zeros(1))
-        return to_theta(lens, borders, self.spacing)
+        return self._rings(lens, lens.theta_max.new_zeros(1)).border_angles
 
-    def last_angle(self, lens: Lens) -> Tensor:
-        """θ at the end of the last ring, (N,) rad."""
-        last = lens.theta_max
-        return last if self.theta_max is None else torch.full_like(last, self.theta_max)
-
-    def _radii(self, lens: Lens, values: Tensor, spacing: Spacing) -> Tensor:
-        """r at values of a spacing, px. Beyond θ_max of a lens, r rises in proportion to θ."""
-        if self.theta_max is None:
-            return change_spacing(lens, values, spacing, "radius")
-        last = lens.theta_max[:, None]
-        beyond = (values - last).clamp(min=0) * (lens.r_max[:, None] / last)
-        return lens.project(torch.minimum(values, last)) + beyond
-
-    def _rings(
-        self, lens: Lens, inner: Spacing, steps: Tensor, rings: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """The ring borders (N, R+1) in units of `spacing`, and points inside the rings,
-        (N, R·len(steps)) in units of `inner`. `steps` are fractions of a ring."""
-        if "tan" in (self.spacing, inner):
-            check_tan(lens)
-        fractions = torch.linspace(
-            0, 1, (rings or self.rings) + 1, dtype=steps.dtype, device=steps.device
-        )
-        first, last = span(lens, self.spacing)
-        if self.theta_max is not None:
-            last = self.last_angle(lens)[:, None]
-        borders = first + (last - first) * fractions
-        edges = change_spacing(lens, borders, self.spacing, inner)
-        begin, end = edges[:, :-1, None], edges[:, 1:, None]
-        return borders, (begin + (end - begin) * steps).flatten(1)
+    def _rings(self, lens: Lens, steps: Tensor) -> Rings:
+        inner = self.inner_spacing
+        return Rings(lens, self.rings, steps, self.spacing, inner, self.theta_max)
 
     def extra_repr(self) -> str:
         return (

@@ -64,15 +64,15 @@ def make_view(
     """
     make = view_class(name)
     options = {k: value for k, value in options.items() if value is not None}
-    given = options | dict(mean=mean, std=std)
+    arguments = options | dict(mean=mean, std=std)
     pair = None if size is None else side_or_pair("size", size)
     parameters = list(inspect.signature(make).parameters.values())
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         known = [parameter.name for parameter in parameters[1:]]
-        if unknown := [option for option in given if option not in known]:
+        if unknown := [option for option in arguments if option not in known]:
             named = ", ".join(known) or "none"
             raise TypeError(f"the view {name!r} has no option {unknown[0]!r}; it has {named}")
-    view = make(pair, **given)
+    view = make(pair, **arguments)
     plain = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items()}
     view.made = dict(name=name, size=pair, **plain)
     return view

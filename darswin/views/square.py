@@ -1,4 +1,7 @@
-"""The image disc as a square."""
+"""The image disc as a square, by a concentric map, which keeps ratios of areas.
+
+Source: Shirley and Chiu, "A Low Distortion Map Between Disk and Square", JGT 1997.
+"""
 
 import math
 
@@ -6,16 +9,9 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.concentric import (
-    points_at,
-    rays_at,
-    square_points,
-    square_rays,
-    square_view,
-)
-from darswin.lens.pixels import OUTSIDE
+from darswin.lens.pixels import as_map, pixel_grid, pixel_rays
 from darswin.lens.solve import length_of, vector_of
-from darswin.lens.spacing import SPACINGS, Spacing
+from darswin.lens.spacing import SPACINGS, Spacing, span, to_spacing, to_theta
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import Pair, PerChannel
 from darswin.views.pixels import PixelView
@@ -26,7 +22,8 @@ from darswin.views.registry import register_view
 class SquareView(PixelView):
     """The image disc as a square, by the concentric map of Shirley and Chiu (JGT 1997).
 
-    Equal steps of `spacing` become equal distances in the square. Pixels that no ray reaches get 0.
+    Nested squares are circles of equal θ, in equal steps of `spacing` from the optical axis to the
+    edge. Pixels that no ray reaches get 0.
 
     Args:
         size: (S, S) of the view.
@@ -72,31 +69,72 @@ class SquareView(PixelView):
         return 2 * lens.theta_max.item() if fov is None else fov, 1.0
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
-        return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
+        return as_map(lens.seen_pixels(*self.pixel_rays(lens, size), size))
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        points = square_points(lens, size, self.spacing, self.theta_max)
-        pixels = ((points + 1) * self.size[0] - 1) / 2
-        return torch.where(points == OUTSIDE, OUTSIDE, pixels)
+        return as_map(self._pixels(lens, *pixel_rays(lens, size)))
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
-        return square_rays(lens, self.size[0], self.spacing, self.theta_max)
+        return self._rays(lens, pixel_grid(self.size, lens.theta_max))
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
-        square = (2 * points + 1) / self.size[0] - 1
-        theta, direction = rays_at(lens, square, self.spacing, self.theta_max)
-        inside = (square.abs().amax(-1) <= 1) & lens.sees(theta)
-        return torch.where(inside[..., None], vector_of(theta, direction), torch.nan)
+        return vector_of(*self._rays(lens, points))
 
     def to_points(self, rays: Tensor, lens: Lens, size: Pair) -> Tensor:
         aside = length_of(rays[..., :2])
         theta = torch.atan2(aside, rays[..., 2])
         theta = torch.where(lens.sees(theta), theta, torch.nan)
-        direction = rays[..., :2] / aside[..., None]
-        square = points_at(lens, theta, direction, self.spacing, self.theta_max)
-        points = ((square + 1) * self.size[0] - 1) / 2
-        return torch.where(square == OUTSIDE, torch.nan, points)
+        return self._pixels(lens, theta, rays[..., :2] / aside[..., None])
+
+    def _rays(self, lens: Lens, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """θ (N, ...) of pixels (N or 1, ..., 2) of the view, rad, NaN beyond its edge and beyond
+        θ_max of the lens, and (cos φ, sin φ)."""
+        radius, direction = square_to_disc((2 * pixels + 1) / self.size[0] - 1)
+        first, last = self._ends(lens, radius.dim())
+        theta = to_theta(lens, first + (last - first) * radius, self.spacing)
+        return torch.where((radius <= 1) & lens.sees(theta), theta, torch.nan), direction
+
+    def _pixels(self, lens: Lens, theta: Tensor, direction: Tensor) -> Tensor:
+        """The inverse of `_rays`; NaN where θ is or is beyond the edge."""
+        inside = ~theta.isnan()  # NaN must not reach the gradients
+        if self.theta_max is not None:
+            inside = inside & (theta <= self.theta_max)
+        first, last = self._ends(lens, theta.dim())
+        value = to_spacing(lens, torch.where(inside, theta, 0.0), self.spacing)
+        square = disc_to_square(((value - first) / (last - first)).clamp(max=1), direction)
+        pixels = ((square + 1) * self.size[0] - 1) / 2
+        return torch.where(inside[..., None], pixels, torch.nan)
+
+    def _ends(self, lens: Lens, dim: int) -> tuple[Tensor, Tensor]:
+        """The values of the spacing in the middle and at the edge, for `dim` dimensions."""
+        first, last = (lens._row(end[:, 0], dim) for end in span(lens, self.spacing))
+        return first, last if self.theta_max is None else torch.full_like(last, self.theta_max)
 
     def extra_repr(self) -> str:
         edge = "" if self.fov is None else f", fov={self.fov:g}"
         return f"{super().extra_repr()}, spacing={self.spacing!r}{edge}"
+
+
+def square_to_disc(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The disc's radius (...), in [0, 1], and (cos φ, sin φ) at points (..., 2) of the square
+    [-1, 1]². The direction is (1, 0) in the middle."""
+    a, b = points.unbind(-1)
+    wide = a.abs() >= b.abs()
+    long, short = torch.where(wide, a, b), torch.where(wide, b, a)
+    turn = math.pi / 4 * short / torch.where(long == 0, 1, long)
+    sign = torch.where(long < 0, -1.0, 1.0).to(points.dtype)
+    along, aside = sign * torch.cos(turn), sign * torch.sin(turn)
+    direction = torch.where(wide, along, aside), torch.where(wide, aside, along)
+    return long.abs(), torch.stack(direction, -1)
+
+
+def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
+    """The inverse of `square_to_disc`. In the middle the direction may be (0, 0)."""
+    c, s = direction.unbind(-1)
+    wide = c.abs() >= s.abs()
+    long, short = torch.where(wide, c, s), torch.where(wide, s, c)
+    turn = torch.atan(short / torch.where(long == 0, 1, long))
+    edge = torch.where(long < 0, -radius, radius)
+    other = edge * turn * (4 / math.pi)
+    points = torch.where(wide, edge, other), torch.where(wide, other, edge)
+    return torch.stack(points, -1)

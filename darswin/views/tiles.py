@@ -129,8 +129,8 @@ class TilesView(PixelView):
         `OUTSIDE` beyond the tiles."""
         height, width = self.size
         best = torch.full((1,), -0.5)
-        found = torch.full((1, 2), OUTSIDE)
-        best, found = best.to(lens.theta_max), found.to(lens.theta_max)
+        points = torch.full((1, 2), OUTSIDE)
+        best, points = best.to(lens.theta_max), points.to(lens.theta_max)
         grid = pixel_grid(size, lens.theta_max)
         for k, tile in enumerate(self.tiles):
             x, y = as_map(tile.to_view(grid, lens, size)).unbind(-1)
@@ -139,8 +139,8 @@ class TilesView(PixelView):
             best = torch.where(inner, margin, best)
             # A point just above the lower edge must not round to the next tile.
             point = torch.stack((x, y.clamp(max=height - 0.51) + k * height), -1)
-            found = torch.where(inner[..., None], point, found)
-        return found
+            points = torch.where(inner[..., None], point, points)
+        return points
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         theta, direction = zip(*(tile.pixel_rays(lens, size) for tile in self.tiles), strict=True)
@@ -152,29 +152,29 @@ class TilesView(PixelView):
     def see(
         self, images: Tensor, prepared: PreparedPixels, dtype: torch.dtype = torch.float32
     ) -> Tensor:
-        seen = self.tiles[0].see(images, prepared, dtype)
-        return seen.unflatten(2, (self.count, -1)).transpose(1, 2).flatten(0, 1)
+        rows = self.tiles[0].see(images, prepared, dtype)
+        return rows.unflatten(2, (self.count, -1)).transpose(1, 2).flatten(0, 1)
 
     def back(self, maps: Tensor, prepared: PreparedPixels) -> Tensor:
         assert prepared.back is not None
         rows = prepared.back[..., 1]
         tile = torch.floor((rows + 0.5) / self.size[0])
         inner = torch.stack((prepared.back[..., 0], rows - tile * self.size[0]), -1)
-        size, one = (maps.shape[2], maps.shape[3]), self.tiles[0]
-        x, y = one.within(one.scaled(inner, size), size).unbind(-1)
+        size, first = (maps.shape[2], maps.shape[3]), self.tiles[0]
+        x, y = first.within(first.scaled(inner, size), size).unbind(-1)
         points = torch.stack((x, y + tile * maps.shape[2]), -1)
         stacked = maps.unflatten(0, (-1, self.count)).transpose(1, 2).flatten(2, 3)
         return sample_at(stacked, torch.where(prepared.back == OUTSIDE, OUTSIDE, points))
 
-    def check_seen(self, seen: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
-        seen = check_seen_images(seen, self.size, channels)
-        if seen.shape[0] % self.count:
+    def check_seen(self, sampled: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
+        sampled = check_seen_images(sampled, self.size, channels)
+        if sampled.shape[0] % self.count:
             raise ValueError(
-                f"sampled must have {self.count} tiles for each image, got {seen.shape[0]}"
+                f"sampled must have {self.count} tiles for each image, got {sampled.shape[0]}"
             )
         assert prepared.points is not None
-        check_count(prepared.points.shape[0], seen[:: self.count])
-        return seen
+        check_count(prepared.points.shape[0], sampled[:: self.count])
+        return sampled
 
     def rays(self, lens: Lens, size: Pair) -> Tensor:
         """The rays of the pixels of the tiles, unit vectors (N, n, H', W', 3); see `RayView`."""

@@ -7,9 +7,9 @@ from lens_examples import ASIDE
 from torch.testing import assert_close
 
 from darswin.lens import Equidistant, Perspective, Polynomial, Spherical
-from darswin.lens.concentric import disc_to_square, square_points, square_to_disc, square_view
 from darswin.lens.pixels import OUTSIDE
 from darswin.lens.spacing import SPACINGS
+from darswin.views.square import SquareView, disc_to_square, square_to_disc
 
 f64 = torch.float64
 
@@ -73,6 +73,7 @@ def test_the_pixels_of_the_square_are_where_their_rays_land_and_back(name, spaci
     lens, size = EXAMPLES[name]
     if spacing == "tan":
         lens = lens.with_theta_max(1.3)
+    view = SquareView((9, 9), spacing=spacing)
     steps = (2 * torch.arange(9, dtype=f64) + 1) / 9 - 1
     r, phi = torch.tensor([[published(a, b) for a in steps] for b in steps], dtype=f64).unbind(-1)
     last = lens.theta_max[:, None, None]
@@ -83,9 +84,9 @@ def test_the_pixels_of_the_square_are_where_their_rays_land_and_back(name, spaci
     }
     if spacing in theta_of:
         expected = lens.project_rays(theta_of[spacing](), phi[None], size)
-        assert_close(square_view(lens, size, 9, spacing), expected, atol=1e-7, rtol=1e-9)
-    places = square_points(lens, size, spacing)
-    beyond = (places == OUTSIDE).all(-1)
+        assert_close(view.image_points(lens, size), expected, atol=1e-7, rtol=1e-9)
+    pixels = view.view_points(lens, size)
+    places, beyond = (2 * pixels + 1) / 9 - 1, (pixels == OUTSIDE).all(-1)
     y, x = torch.meshgrid(*(torch.arange(side, dtype=f64) for side in size), indexing="ij")
     theta, azimuth = lens.unproject_pixels(torch.stack((x, y), -1)[None], size)
     assert torch.equal(beyond, ~lens.sees(theta))
@@ -101,7 +102,7 @@ def test_the_pixels_of_the_square_are_where_their_rays_land_and_back(name, spaci
 
 
 def test_tan_ends_before_90_degrees():
-    for function in (lambda lens: square_view(lens, (8, 8), 8, "tan"),
-                     lambda lens: square_points(lens, (8, 8), "tan")):  # fmt: skip
-        refused("spacing='tan' needs lenses with θ_max below 90°", function, Equidistant(4.0, 1.6))
-        assert function(Perspective(4.0, 1.2)).isfinite().all()
+    view, too_wide = SquareView((8, 8), spacing="tan"), Equidistant(4.0, 1.6)
+    for points in (view.image_points, view.view_points):
+        refused("spacing='tan' needs lenses with θ_max below 90°", points, too_wide, (8, 8))
+        assert points(Perspective(4.0, 1.2), (8, 8)).isfinite().all()
