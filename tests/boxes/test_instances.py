@@ -1,7 +1,6 @@
 """Instances: columns that are joined, chosen and moved together."""
 
 import numpy as np
-import pytest
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
@@ -56,8 +55,7 @@ def test_rows_are_chosen_as_those_of_an_array():
     for rows in (1, slice(1, 2), [1], np.array([False, True, False])):
         assert all_three[rows].labels.tolist() == [1]
     assert [instance.labels.item() for instance in all_three] == [0, 1, 2]
-    with pytest.raises(IndexError):
-        all_three[3]
+    refused("out of bounds", all_three.__getitem__, 3, error=IndexError)
 
 
 def test_columns_that_do_not_fit_are_named():
