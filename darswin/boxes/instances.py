@@ -21,21 +21,23 @@ _ROUNDING = 1e-3  # px: a keypoint that is this little beyond the edge of a pict
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """The things that are found or labelled in a picture, as columns of K rows.
+    """The detections or the labels of a picture, as columns of K rows.
 
-    `instances[rows]` are some of them; rows: an index, a slice, or an array. A column is None if
-    nothing is known of it.
+    `Instances(boxes=np.array([[10.0, 20, 50, 80]]), scores=np.array([0.9]), labels=np.array([1]))`
+    is one detection. `instances[rows]` are some instances; rows: an index, a slice, or an array.
+    Iteration gives them one by one. A column is None if nothing is known of it.
 
     Attributes:
-        boxes: (K, 4) x0, y0, x1, y1 in px, or turned (K, 5), see `darswin.boxes`; NaN if nothing of
-            an instance is shown.
+        boxes: (K, 4) x0, y0, x1, y1 in px, or turned (K, 5), see `darswin.boxes`; NaN if the
+            picture does not show the instance. `upright` is (K, 4) of both.
         scores: (K,).
         labels: (K,) numbers of classes or ids of categories.
         keypoints: (K, P, 2 or 3): x and y in px, NaN if they are unknown or not shown, and a score,
-            or COCO's v for labels: 0 unknown, 1 hidden, 2 seen. It is NaN beyond an instance's own
-            keypoints, if others have more.
-        masks: of each, the run lengths of `darswin.boxes.encode_rle`, or None; or the probabilities
-            of pixels (K, h, w), of the picture or of a whole fraction of it.
+            or COCO's v for labels: 0 not labelled, 1 not visible, 2 visible. Rows beyond the
+            keypoints of an instance are NaN.
+        masks: of each, the run lengths of `darswin.boxes.encode_rle`, or None. `OnnxNetwork` gives
+            the probabilities of pixels (K, h, w) in their place, of the picture or of a whole
+            fraction of it; `areas`, `masks` of `through` and files need run lengths.
         outlines: of each, the parts of its outline, polygons (P, 2); none if it is not known.
         more: other columns by their names, such as "visible" (K,), the share of an instance that
             its picture shows, 0 to 1. Each is an array or a list.
@@ -85,11 +87,17 @@ class Instances:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The instances of all parts, one after another. Of `more`, the columns that all have.
+        """The instances of all parts, one after another.
+
+        If some boxes are turned, all are. Keypoints get rows of NaN up to the largest number of
+        points, and masks and outlines of parts without them are unknown. Of `more`, the columns
+        that all have stay.
 
         Raises:
-            ValueError: some parts have scores or labels, and others have none.
+            ValueError: some parts with rows have scores or labels, and others have none; or some
+                keypoints have 2 columns, and others 3.
         """
+        parts = [part for part in parts if len(part)] or parts[:1]
         if not parts:
             return cls(np.zeros((0, 4)), labels=np.zeros(0, int))
         columns = {name: [getattr(part, name) for part in parts] for name, _ in parts[0]._columns()}
@@ -109,7 +117,13 @@ class Instances:
         return cls(**{name: _concatenated(of) for name, of in columns.items()}, more=more)
 
     def merged(self, *, iou: float = 0.5, inside: float = 0.7) -> Self:
-        """The best of those that show the same thing, the best first; see `darswin.boxes.merge`."""
+        """The best of those that show the same thing, the best first; see `darswin.boxes.merge`.
+
+        Raises:
+            ValueError: there are no scores or no labels.
+        """
+        if self.scores is None or self.labels is None:
+            raise ValueError("instances need scores and labels to be merged")
         return self[merge(self.boxes, self.scores, self.labels, iou=iou, inside=inside)]
 
     @property
@@ -141,15 +155,16 @@ class Instances:
         Args:
             points_map: from this picture to the new one.
             size: (H, W) of the new picture.
-            cut: (H, W) of this picture, if upright boxes end at its borders.
+            cut: (H, W) of this picture, to which upright boxes are clipped first.
             masks: resamples a mask (H, W), bool, to the new picture. Without it, masks are left
                 out, and boxes do not follow them.
             rays: from points of this picture to rays.
 
         Returns:
-            The instances with "visible" (K,), the share that is shown, which counts from the first
-            picture; and with "rays" (K, 3) if `rays` is given: the directions of the middles of the
-            boxes here, 0 where there are none. Of what is not shown at all, boxes are NaN.
+            The instances with "visible" (K,), the share that is shown, multiplied by the share that
+            was visible before; and with "rays" (K, 3) if `rays` is given: the directions of the
+            middles of the boxes here, 0 where there are none. Of what is not shown at all, boxes
+            are NaN.
         """
         old = self.boxes
         if cut is not None:
@@ -204,6 +219,8 @@ def _concatenated(parts: Sequence[Any]) -> Any:
 def _padded(parts: Sequence[np.ndarray | None], counts: Sequence[int]) -> list[np.ndarray]:
     """Keypoints of several parts, with rows of NaN up to the largest number of points."""
     shapes = [part.shape[1:] for part in parts if part is not None]
+    if len({shape[1] for shape in shapes}) > 1:
+        raise ValueError("keypoints must have 2 columns in all parts, or 3 in all")
     most, width = max(shape[0] for shape in shapes), shapes[0][1]
     padded = [np.full((count, most, width), np.nan) for count in counts]
     for table, part in zip(padded, parts, strict=True):

@@ -244,7 +244,7 @@ class NetworkAnswers(Answers):
             ]
         detections = in_picture(bound.remap, tiles)
         if tiles[0].masks is not None:
-            # One by one: those of all instances could fill the memory.
+            # One by one: all masks at once could fill the memory.
             masks = [
                 encode_rle(bound.remap.tiles[tile].back(tiles[tile].masks[row, None])[0] > 0.5)
                 for tile, row in detections.more["source"].tolist()

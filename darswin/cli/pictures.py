@@ -1,6 +1,5 @@
-"""The door by which pictures come into commands: files, folders, videos and streams, with their
-turns and lenses; what is made of each lens once; the files that cannot be read; and the folder that
-is written to.
+"""Pictures for commands: files, folders, videos and streams, with their orientations and lenses.
+Also what is kept for each lens, the files that cannot be read, and the folder that is written to.
 """
 
 import json
@@ -29,7 +28,8 @@ Made = TypeVar("Made")
 
 
 class Picture(NamedTuple):
-    """An upright picture or frame, (H, W, C) uint8, with its lens; entry: its name as JSON."""
+    """An upright picture or frame, (H, W, C) uint8, with its lens; entry: {"image": name}, or the
+    name of a video with "frame" and "time"."""
 
     entry: dict[str, Any]
     image: np.ndarray
@@ -50,7 +50,11 @@ class File(NamedTuple):
     def pictures(
         self, lenses: "Calibrations", channels: int | None = None, every: int = 1
     ) -> Iterator[Picture]:
-        """The picture, or each `every`-th frame. Without `channels`, it has those of the file.
+        """The picture, or the frames.
+
+        Args:
+            channels: 1 or 3; None means those of the file, and 3 for videos.
+            every: the step between frames.
 
         Raises:
             BrokenImageError: the file cannot be read, or has no lens that fits.

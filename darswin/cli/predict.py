@@ -7,23 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from darswin.cli.answers import (
-    ANSWERS_OF,
-    TOP,
-    Answers,
-    ClassAnswers,
-)
+from darswin.cli.answers import ANSWERS_OF, TOP, Answers, ClassAnswers
 from darswin.cli.arguments import check_out
 from darswin.cli.lenses import given_lenses, lenses_of_run
 from darswin.cli.options import check_folder
-from darswin.cli.pictures import (
-    Broken,
-    File,
-    check_paths,
-    claim_folder,
-    file_names,
-    files_at,
-)
+from darswin.cli.pictures import Broken, File, check_paths, claim_folder, file_names, files_at
 from darswin.compat import load_official
 from darswin.data.cameras import Calibrations
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
@@ -153,7 +141,7 @@ def predict(
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
         raise ValueError("missing --lens: give the camera's calibration file")
-    check_paths(path for path in paths if not is_stream(path))
+    check_paths(path for path in paths if not is_stream(path))  # before a model is read
     if network is None:
         kind, make = _of_model(weights, TOP if top is None else top)
     else:
@@ -165,10 +153,10 @@ def predict(
         task = None if told and kind == "detections" else task
     if task not in (None, kind):
         raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
-    if top is not None and kind not in ("classification", "numbers"):
+    prints = kind in ("classification", "numbers")
+    if top is not None and not prints:
         text = f"`top` is for the classes of pictures, but {weights} is a model for {kind}"
         raise naming(ValueError(text), "top")
-    prints = kind in ("classification", "numbers")
     files = files_at(paths, leave_out=None if prints else out, streams=True)
     names = [file.said for file in files]
     read = [*names, str(weights), *([] if lens is None else [lens])]

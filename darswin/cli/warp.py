@@ -55,8 +55,8 @@ def warp(
 ) -> None:  # fmt: skip
     """Writes a data set, its pictures and labels, as another lens or a view sees it.
 
-    Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. What
-    is visible by less than a fifth in the new picture is left out and listed in left.json. The same
+    Polygons, masks and keypoints move exactly, and boxes without them as the ellipse inside. An
+    instance of which less than a fifth is visible is left out and listed in left.json. The same
     command goes on where an earlier run was stopped. Pictures and labels that cannot be read are
     named at the end; all others are written.
 

@@ -51,10 +51,10 @@ class Rings:
 
     Args:
         lens: N lenses. rings: R.
-        steps: the points inside a ring, (S,), as fractions of it.
-        spacing: of the borders. inner: of the points.
-        theta_max: θ of the last border, rad, with the spacings "theta"; None means θ_max of each
-            lens. Beyond θ_max of a lens, r rises in proportion to θ.
+        steps: the points inside a ring, (S,), as fractions of it, in [0, 1].
+        spacing: of the borders. inner: the spacing of the points.
+        theta_max: θ of the last border, rad; both spacings must then be "theta". None means θ_max
+            of each lens. Beyond θ_max of a lens, r rises in proportion to θ.
 
     Raises:
         ValueError: a spacing is "tan" and a lens has θ_max ≥ 90°.

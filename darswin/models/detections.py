@@ -1,4 +1,4 @@
-"""Detections of networks behind views, carried to the pixels of the images."""
+"""Detections of networks behind views, moved to the pixels of the images."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -47,8 +47,15 @@ def in_picture(remap: Remap, tiles: Sequence[Instances]) -> Instances:
     """The detections in a view, or in each of its tiles, in the picture, the best first.
 
     Those of several tiles are merged, and what the picture does not show is left out. Boxes are cut
-    at the borders of the view first. `more` gets "visible", "rays" if the view uses the lens, and
-    "source" (K, 2): the tile and the row in it, by which masks, which are left out, can follow.
+    at the borders of the view first.
+
+    Args:
+        remap: of the view.
+        tiles: for each tile, its detections with scores and labels, in px of the tile.
+
+    Returns:
+        Instances without masks. `more` gets "visible", "rays" if the view uses the lens, and
+        "source" (K, 2): of each detection, its tile and its row there, by which masks can follow.
     """
     parts = []
     for number, (tile, detections) in enumerate(zip(remap.tiles, tiles, strict=True)):
@@ -68,7 +75,7 @@ def in_picture(remap: Remap, tiles: Sequence[Instances]) -> Instances:
 def detections_to_images(
     detections: Sequence[Mapping[str, Tensor]], view: View, prepared: Prepared
 ) -> list[dict[str, Tensor]]:
-    """Carries the detections of the pictures that a view shows to the pixels of the images.
+    """Moves the detections of the pictures that a view shows to the pixels of the images.
 
     Args:
         detections: for each picture, boxes (K, 4 or 5), scores (K,) and labels (K,); and optionally
@@ -96,8 +103,8 @@ def detections_to_images(
         moved = in_picture(remap, [*map(_instances, tiles)])
         names = [name for name in tiles[0] if all(name in tile for tile in tiles)]
         starts = np.cumsum([0, *(len(tile["boxes"]) for tile in tiles)])
-        tile, row = moved.more["source"].T
-        rows = torch.from_numpy(starts[tile] + row)
+        tile_of, row_of = moved.more["source"].T
+        rows = torch.from_numpy(starts[tile_of] + row_of)
         result = {name: torch.cat([tile[name] for tile in tiles]) for name in names}
         result = {name: column[rows.to(column.device)] for name, column in result.items()}
         columns = {"boxes": moved.boxes, "keypoints": moved.keypoints, **moved.more}
@@ -107,7 +114,7 @@ def detections_to_images(
                 dtype = like.dtype if like.is_floating_point() else torch.float32
                 result[name] = torch.from_numpy(columns[name]).to(like.device, dtype)
         if "masks" in result:
-            result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile), remap)
+            result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile_of), remap)
         results.append(result)
     return results
 
@@ -140,7 +147,7 @@ def _masks_in_image(masks: Tensor, tiles: Tensor, remap: Remap) -> Tensor:
     """Masks (K, 1, H', W') of `tiles` (K,) in the pixels of the image, (K, 1, H, W)."""
     in_image = masks.new_zeros(*masks.shape[:-2], *remap.size)
     for number in tiles.unique().tolist():
-        mine = (tiles == number).to(masks.device)
-        maps = masks[mine].reshape(1, -1, *masks.shape[-2:]).cpu()
-        in_image[mine] = remap.tiles[number].back(maps).view_as(in_image[mine]).to(masks)
+        of_tile = (tiles == number).to(masks.device)
+        maps = masks[of_tile].reshape(1, -1, *masks.shape[-2:]).cpu()
+        in_image[of_tile] = remap.tiles[number].back(maps).view_as(in_image[of_tile]).to(masks)
     return in_image

@@ -128,7 +128,7 @@ class Remap:
         return self._boxes(boxes, self.to_image, (self.view_size, self.size), self.rays)
 
     def boxes_to_view(self, boxes: Any) -> tuple[Any, Any, Any]:
-        """Boxes (K, 4) of the picture → boxes of the view: the inverse of `boxes_to_image`."""
+        """Boxes (K, 4 or 5) of the picture → boxes of the view, as `boxes_to_image` back."""
         sizes = self.size, self.view_size
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
 

@@ -22,7 +22,14 @@ import numpy as np
 from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, known_keypoints, labelled
+from darswin.data.labels.labels import (
+    LabelledPictures,
+    Labels,
+    Size,
+    check_labels,
+    known_keypoints,
+    labelled,
+)
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
@@ -33,7 +40,7 @@ _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "
 _DIGITS = 3  # after the point, in pixels
 _SHARE_DIGITS = 4  # of scores, visible shares and degrees
 _SAME = 0.1  # px, of corners that are rounded
-_FAR = 100  # times the longer side of a picture: no thing reaches that far
+_FAR = 100  # times the longer side of a picture: no instance reaches that far
 
 
 def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
@@ -130,7 +137,13 @@ def write_coco(
     Args:
         pictures: of each picture, its entry, such as {"file_name": "a.png"}, and its labels.
         categories: as in `LabelledPictures`.
+
+    Raises:
+        ValueError: an instance has no label or that of no category, or its box is NaN because its
+            picture does not show it.
     """
+    for _, labels in pictures:
+        check_labels(labels.instances, {category["id"] for category in categories})
     entries = [
         {**entry, "height": labels.size[0], "width": labels.size[1]} for entry, labels in pictures
     ]
@@ -155,14 +168,15 @@ def _number(entries: Sequence[dict]) -> None:
 def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
     """The instances of one picture as COCO's annotations or results, without ids of their own.
 
-    A turned box is written as its outline, the upright box around it, and in degrees as CVAT's
-    `rotation`. Keypoints that are not known or not shown are 0, 0, 0.
+    A turned box is written as its outline, its angle in degrees, as CVAT's `rotation`, and as
+    `bbox` the upright box around it, where CVAT has the box before it is turned. Keypoints that
+    are not known or not shown are 0, 0, 0.
     """
-    more, areas = instances.more, instances.areas.tolist()
+    more, areas, labels = instances.more, instances.areas.tolist(), instances.labels.tolist()
     annotations = []
     for k, (x0, y0, x1, y1) in enumerate(instances.upright):
         annotation: dict[str, Any] = dict(more["entry"][k]) if "entry" in more else {}
-        annotation["category_id"] = instances.labels[k : k + 1].tolist()[0]
+        annotation["category_id"] = labels[k]
         annotation["bbox"] = _rounded((x0, y0, x1 - x0, y1 - y0))
         annotation["area"] = round(areas[k], _DIGITS)
         if "crowd" in more:
@@ -283,7 +297,7 @@ def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> In
             )
             raise ValueError(f"{what}, and neither an outline nor a mask with an area")
     limit = _FAR * max(size)
-    if any((np.abs(corners) > limit).any() for corners in (box, *polygons)):
+    if any((np.abs(points) > limit).any() for points in (box, *polygons)):
         raise ValueError(
             f"has a box or polygon that reaches farther than {limit} px from its picture of "
             f"{size[1]} × {size[0]} px"
@@ -312,15 +326,14 @@ def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> In
 
 def _turned(box: np.ndarray, polygons: Sequence[np.ndarray], angle: float) -> np.ndarray | None:
     """The turned box (5,) of CVAT's rotation, whose `bbox` is the box before it is turned; or that
-    of `coco_annotations`, whose outline are its corners. None for another outline."""
+    of `coco_annotations`, whose outline is its corners. None for another outline."""
     if not polygons:
         return np.array([*(box[:2] + box[2:]) / 2, *(box[2:] - box[:2]), angle])
-    outline = polygons[0]
-    sides = np.linalg.norm(outline[[1, 3]] - outline[0], axis=1) if len(outline) == 4 else (0, 0)
+    if len(polygons) > 1 or len(outline := polygons[0]) != 4:
+        return None
+    sides = np.linalg.norm(outline[[1, 3]] - outline[0], axis=1)
     turned = np.array([*outline.mean(0), *sides, angle])
-    is_box = len(polygons) == 1 and len(outline) == 4
-    is_box = is_box and np.abs(corners(turned[None])[0] - outline).max() < _SAME
-    return turned if is_box else None
+    return turned if np.abs(corners(turned[None])[0] - outline).max() < _SAME else None
 
 
 def _mirror(names: Sequence[str]) -> list[int]:

@@ -1,6 +1,6 @@
 """The labels of a picture, which move with it, and the pictures of a data set."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +26,8 @@ class Labels(NamedTuple):
     the picture, because less than `LEAST_VISIBLE` of them, a fifth, is visible.
 
     The instances of files of labels have these columns in `more`: "crowd" (K,), whether it is a
-    group; "visible" (K,); "mirror", of each keypoint the one that becomes it in a mirrored picture,
-    none if that is not known; and "entry", what else the file says of an instance.
+    group; "visible" (K,); "mirror", K lists: of each keypoint the one that becomes it in a mirrored
+    picture, none if that is not known; and "entry", K dicts: what else the file says of them.
     """
 
     instances: Instances
@@ -43,8 +43,8 @@ def labelled(
 ) -> Instances:  # fmt: skip
     """One instance of a file of labels, K = 1; box: (4 or 5,); keypoints: (P, 3), with COCO's v."""
     if keypoints is not None:
-        unknown = np.broadcast_to([[True, True, False]], keypoints.shape) & (keypoints[:, 2:] == 0)
-        keypoints = np.where(unknown, np.nan, keypoints)[None]
+        keypoints = keypoints.copy()[None]
+        keypoints[keypoints[..., 2] == 0, :2] = np.nan
     return Instances(
         box[None], labels=np.array([label], None if isinstance(label, int) else object),
         keypoints=keypoints, masks=[mask], outlines=[outline],
@@ -63,13 +63,21 @@ def known_keypoints(points: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(points).all(1, keepdims=True), points, 0.0)
 
 
-def moved(labels: Labels, remap: Remap) -> Labels:
-    """The labels of the picture that a view shows.
+def check_labels(instances: Instances, known: Collection[Any]) -> list[Any]:
+    """The labels. ValueError for what a file cannot hold: none, one that is not `known`, NaN."""
+    labels = [] if instances.labels is None else instances.labels.tolist()
+    if len(labels) != len(instances):
+        raise ValueError("instances need labels to be written")
+    if unknown := [label for label in labels if label not in known]:
+        raise ValueError(f"the label {unknown[0]!r} is that of no category")
+    if np.isnan(instances.boxes).any():
+        raise ValueError("a box is NaN: leave out instances that the picture does not show")
+    return labels
 
-    Polygons, keypoints and masks move exactly, and boxes follow from them. Instances of which only
-    the box is known move as the ellipse inside it. All are cut at the borders of the new picture,
-    and where it shows nothing.
-    """
+
+def moved(labels: Labels, remap: Remap) -> Labels:
+    """The labels of the picture that a view shows; see `Instances.through`. Those of which less
+    than `LEAST_VISIBLE` is visible are left out, and counted in `lost`."""
     instances = move_instances(labels.instances, remap)
     stays = instances.more["visible"] >= LEAST_VISIBLE
     return Labels(instances[stays], remap.view_size, labels.lost + int((~stays).sum()))

@@ -22,7 +22,14 @@ import yaml
 from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.labels import LabelledPictures, Labels, Size, known_keypoints, labelled
+from darswin.data.labels.labels import (
+    LabelledPictures,
+    Labels,
+    Size,
+    check_labels,
+    known_keypoints,
+    labelled,
+)
 from darswin.data.scenes.files import calibration_in, pictures_in
 from darswin.utils.files import replace_file
 from darswin.utils.text import read_text
@@ -70,7 +77,7 @@ def write_yolo(
     """Writes the text files and `data.yaml` for pictures in `root`; arguments as for `write_coco`.
 
     The classes are the categories in their order. Crowds are left out, as YOLO has none; see
-    `yolo_lines` for the others.
+    `yolo_lines` for the others. Raises the errors of `write_coco`.
 
     Args:
         more: other entries of `data.yaml`, such as the splits.
@@ -82,8 +89,8 @@ def write_yolo(
         if "crowd" in instances.more:
             instances = instances[~instances.more["crowd"]]
         if instances.keypoints is not None and len(instances):
-            shape = list(instances.keypoints.shape[1:])
-        classes = [number[label] for label in instances.labels.tolist()]
+            shape = [instances.keypoints.shape[1], 3]
+        classes = [number[label] for label in check_labels(instances, number)]
         lines = yolo_lines(replace(instances, labels=np.array(classes)), labels.size)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))
         replace_file(text, lines)
@@ -94,10 +101,11 @@ def write_yolo(
 
 
 def yolo_lines(instances: Instances, size: Size) -> str:
-    """The lines of one picture of (H, W): class, place, and score if there are scores.
+    """The lines of the instances of a picture of (H, W): class, place, and score if there are any.
 
     The place is the outline, whose parts are joined, or that of the mask; the corners of a turned
-    box; or else the box. Instances with keypoints are written as boxes, as YOLO has no both.
+    box; or else the box. Instances with keypoints are written as boxes, since a line of YOLO
+    holds either an outline or keypoints.
     """
     sides, upright = np.array(size[::-1], float), instances.upright.reshape(-1, 2, 2)
     lines = []
