@@ -67,5 +67,9 @@ def test_columns_that_do_not_fit_are_named():
         (ValueError, "name must have 2 rows, as the boxes, got 0", dict(more={"name": []})),
     ):
         refused(said, lambda c=columns: Instances(**{"boxes": np.zeros((2, 4))} | c), error=error)
-    parts = instances_of(1, 4, None, False, False), Instances(np.zeros((1, 4)))
-    refused("either all parts or none must have scores", Instances.joined, parts)
+    row, other = instances_of(1, 4, None, False, False), Instances(np.zeros((1, 4)))
+    refused("either all parts or none must have scores", Instances.joined, [row, other])
+    assert len(Instances.joined([row, other[:0]])) == 1  # a tile without detections
+    refused("need scores and labels to be merged", other.merged)
+    parts = [Instances(other.boxes, keypoints=np.zeros((1, 3, width))) for width in (2, 3)]
+    refused("keypoints must have 2 columns in all parts", Instances.joined, parts)

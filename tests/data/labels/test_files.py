@@ -128,6 +128,19 @@ def test_ids_are_numbered_where_they_are_missing(tmp_path):
     assert len(read_coco(file).labels(1).instances) == 2
 
 
+@pytest.mark.parametrize("write_labels", [write_coco, write_yolo])
+def test_what_files_cannot_hold_is_refused(tmp_path, write_labels):
+    box = np.array([[1.0, 2, 3, 4]])
+    for said, columns in (
+        ("the label 7 is that of no category", dict(labels=np.array([7]))),
+        ("a box is NaN", dict(boxes=box * np.nan, labels=np.array([1]))),
+        ("instances need labels", dict()),
+    ):
+        labels = Labels(Instances(**{"boxes": box} | columns), SIZE)
+        pictures = [({"file_name": "a.png"}, labels)]
+        refused(said, write_labels, tmp_path / "new", pictures, CATEGORIES)
+
+
 def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
     file = write(tmp_path, "train", "annotations/instances_train.json")
     (tmp_path / "lens.json").write_text('{"model": "Equidistant", "focal": 20, "theta_max": 1}')
