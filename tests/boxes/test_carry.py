@@ -66,10 +66,6 @@ def test_the_half_pixel():
     carried, _ = boxes.carry([[0, 0, 4, 2]], mirror)
     np.testing.assert_allclose(carried, [[6, 0, 10, 2]], atol=1e-12)
     np.testing.assert_allclose(boxes.carry_points([[0.5, 0.5]], mirror), [[9.5, 0.5]])
-    mask = np.zeros((2, 10), bool)
-    mask[:, :4] = True
-    carried_mask = boxes.carry_mask(mask, mirror, mask.shape)
-    assert np.flatnonzero(carried_mask[0]).tolist() == [6, 7, 8, 9]
 
 
 FLAT = Perspective(focal=215.0, theta_max=1.2, image_size=(512, 512))

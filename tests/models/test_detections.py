@@ -105,11 +105,6 @@ def test_detections_of_every_view_come_back_to_the_things_in_the_picture(name, k
         assert sorted(found["labels"].tolist()) == [0, 1, 2, 3]
 
 
-class Wrapped(nn.Module):
-    def forward(self, out):
-        return dict(found=out)
-
-
 @torch.no_grad()
 def test_every_form_of_detections_gives_the_same():
     lens, (images, _) = LENSES["radial"], disks(LENSES["radial"])
@@ -117,8 +112,7 @@ def test_every_form_of_detections_gives_the_same():
     view = make_view("tiles", (256, 256))
     as_list = LensAdapter(Disks(), view=view)(images, lens)
     assert [len(found["boxes"]) for found in as_list] == [4, 4]
-    wrapped = nn.Sequential(Disks(), Wrapped())
-    by_function = LensAdapter(wrapped, view=view, boxes=lambda out: out["found"])
+    by_function = LensAdapter(nn.Identity(), view=view, boxes=Disks())
     for one, other in zip(as_list, by_function(images, lens), strict=True):
         assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -151,9 +145,6 @@ class _Constant(nn.Module):
         self.found = boxes
 
     def forward(self, x):
-        return self.found_dict()
-
-    def found_dict(self):
         count = len(self.found)
         return dict(boxes=self.found, scores=torch.linspace(1, 0.5, count),
                     labels=torch.zeros(count, dtype=torch.long))  # fmt: skip
@@ -195,7 +186,7 @@ def test_detections_that_do_not_fit_are_refused():
     for view in ("mercator", "none"):
         with pytest.raises(ValueError, match="for each of its 2 pictures, got 1 results"):
             LensAdapter(network, 64, view=view)(images.expand(2, -1, -1, -1), lens)
-    for wrong in (network.found_dict()["boxes"], {"boxes": np.zeros((1, 4))}, [1, 2]):
+    for wrong in (network.found, {"boxes": np.zeros((1, 4))}, [1, 2]):
         with pytest.raises(TypeError, match="boxes must return a dict of tensors boxes, scores"):
             LensAdapter(network, 64, view="tiles", boxes=lambda _, w=wrong: w)(images, lens)
     with pytest.raises(ValueError, match="a polar image"):

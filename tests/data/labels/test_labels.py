@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.boxes import Instances, decode_rle, encode_rle, iou
+from darswin.boxes.regions import box_of
 from darswin.data import Sample
 from darswin.data.labels import Labels, moved
 from darswin.data.labels.labels import LEAST_VISIBLE, labelled
@@ -38,21 +39,12 @@ def blob(center, radius):
     return center + radius * around[:, None] * np.stack((np.cos(angle), np.sin(angle)), -1)
 
 
-def box_of(polygon):
-    return np.concatenate((polygon.min(0), polygon.max(0)))
-
-
 def filled(polygons, size=SIZE, fine=8):
     """The pixels of which polygons cover more than a half, by OpenCV in a finer picture."""
     points = [np.round((p * fine - 0.5) * 16).astype(np.int32) for p in polygons]
     sides = np.array(size) * fine
     mask = cv2.fillPoly(np.zeros(sides, np.uint8), points, 255, shift=4)
     return (cv2.resize(mask, size[::-1], interpolation=cv2.INTER_AREA) > 127).astype(np.uint8)
-
-
-def mask_box(mask):
-    y, x = np.nonzero(mask)
-    return np.array([[x.min(), y.min(), x.max() + 1, y.max() + 1]])
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -63,7 +55,7 @@ def test_labels_follow_the_picture(way, form):
     mask = filled([outline])
     shape = dict(polygon={"outline": [outline]}, mask={"mask": encode_rle(mask)}, box={})[form]
     image = np.repeat(mask[..., None] * np.uint8(255), 3, 2)
-    labels = Labels(labelled(7, box_of(outline), **shape), SIZE)
+    labels = Labels(labelled(7, box_of([outline]), **shape), SIZE)
     sample = Sample(image, labels, LENS).through(WAYS[way])
     assert isinstance(sample.target, Labels)
     found, size, lost = sample.target
@@ -79,9 +71,15 @@ def test_labels_follow_the_picture(way, form):
         np.testing.assert_array_equal(mask_box(drawn), found.boxes)
     else:
         drawn = filled(found.outlines[0], size) > 0
-        np.testing.assert_allclose(found.boxes[0], box_of(np.concatenate(found.outlines[0])))
+        corners = np.concatenate(found.outlines[0])
+        np.testing.assert_allclose(found.boxes[0], [*corners.min(0), *corners.max(0)])
     assert (drawn & shown).sum() / (drawn | shown).sum() > 0.96
     assert found.areas == pytest.approx([shown.sum()], rel=0.03)
+
+
+def mask_box(mask):
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return np.array([[x, y, x + width, y + height]])
 
 
 def square(x, y, side=20.0):
@@ -95,7 +93,7 @@ def cropped(*part):
 def test_what_leaves_the_picture():
     """Crops of 100 px: squares are cut at the border, and left out below a fifth."""
     outlines = [square(x, 50) for x in (-10, 85, 94, 97, 300)]
-    columns = dict(boxes=np.array([*map(box_of, outlines)]), labels=np.arange(5))
+    columns = dict(boxes=np.array([box_of([outline]) for outline in outlines]), labels=np.arange(5))
     masks = [encode_rle(filled([np.clip(outline, 0, 319)])) for outline in outlines]
     # A mask ends at the picture.
     for shapes, first in ((dict(outlines=[[o] for o in outlines]), 0.5), (dict(masks=masks), 1.0)):
@@ -111,7 +109,7 @@ def test_what_leaves_the_picture():
 
 
 def test_visible_shares_add_up_over_moves():
-    whole = labelled(1, box_of(square(40, 40)), outline=[square(40, 40)])
+    whole = labelled(1, box_of([square(40, 40)]), outline=[square(40, 40)])
     once = moved(Labels(whole, SIZE), cropped(0, 0, 240, 50))
     twice = moved(once, cropped(0, 0, 50, 50))
     assert once.instances.more["visible"] == pytest.approx([0.5])
@@ -158,7 +156,7 @@ HALF = SimpleNamespace(
 @pytest.mark.parametrize("form", ["polygon", "box"])
 def test_an_instance_at_the_seam_of_a_view_keeps_its_larger_part(form):
     outline = square(57, 20)
-    whole = labelled(1, box_of(outline), outline=[outline] if form == "polygon" else [])
+    whole = labelled(1, box_of([outline]), outline=[outline] if form == "polygon" else [])
     found, *_ = moved(Labels(whole, (80, 100)), SHIFTED)
     atol = 4 if form == "polygon" else 1
     np.testing.assert_allclose(found.boxes, [[87, 20, 100, 40]], atol=atol)
@@ -167,11 +165,11 @@ def test_an_instance_at_the_seam_of_a_view_keeps_its_larger_part(form):
 
 def test_an_instance_that_is_partly_unseen():
     outline = square(40, 20)
-    whole = labelled(1, box_of(outline), outline=[outline])
+    whole = labelled(1, box_of([outline]), outline=[outline])
     found, *_ = moved(Labels(whole, (80, 100)), HALF)
     np.testing.assert_allclose(found.boxes, [[40, 20, 50, 40]], atol=2)
     assert found.more["visible"] == pytest.approx([0.5], abs=0.1)
-    behind = Instances(np.tile(box_of(square(60, 20)), (2, 1)))
+    behind = Instances(np.tile(box_of([square(60, 20)]), (2, 1)))
     none, *rest = moved(Labels(behind, (80, 100)), HALF)
     assert not len(none) and rest == [(80, 100), 2]
 
@@ -191,7 +189,7 @@ def test_polygons_are_cut_at_the_border_like_their_masks(seed):
     rng = np.random.default_rng(seed)
     outline = blob(rng.uniform(40, 200, 2), rng.uniform(30, 90))
     part = (60, 50, 100, 120)
-    whole = Labels(labelled(1, box_of(outline), outline=[outline]), SIZE)
+    whole = Labels(labelled(1, box_of([outline]), outline=[outline]), SIZE)
     found, *_ = moved(whole, cropped(*part))
     mask = filled([outline + 200], (700, 700))
     inside = filled([outline])[60:160, 50:170]
@@ -207,7 +205,7 @@ def test_a_perspective_picture_through_a_fisheye_lens_by_formula():
     own = Perspective.from_fov(math.radians(80), 120.0, image_size=SIZE).with_theta_max(1.0)
     new = Equidistant.from_fov(math.radians(120), 150.0, image_size=(300, 300))
     outline = blob((200, 100), 30)
-    whole = Labels(labelled(1, box_of(outline), outline=[outline]), SIZE)
+    whole = Labels(labelled(1, box_of([outline]), outline=[outline]), SIZE)
     found, *_ = moved(whole, CameraView(new).at(own, SIZE))
     flat = (outline - [160, 120]) / own.focal.item()
     radius = np.linalg.norm(flat, axis=1, keepdims=True)
