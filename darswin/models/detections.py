@@ -107,12 +107,19 @@ def detections_to_images(
         rows = torch.from_numpy(starts[tile_of] + row_of)
         result = {name: torch.cat([tile[name] for tile in tiles]) for name in names}
         result = {name: column[rows.to(column.device)] for name, column in result.items()}
-        columns = {"boxes": moved.boxes, "keypoints": moved.keypoints, **moved.more}
+        columns = {"boxes": moved.boxes, **moved.more}
+        if "keypoints" in result:
+            columns["keypoints"] = moved.keypoints[..., :2]
         for name in ("boxes", "visible", "rays", "keypoints"):
-            if columns.get(name) is not None:
-                like = result.get(name, result["boxes"])
-                dtype = like.dtype if like.is_floating_point() else torch.float32
-                result[name] = torch.from_numpy(columns[name]).to(like.device, dtype)
+            if name not in columns:
+                continue
+            like = result.get(name, result["boxes"])
+            dtype = like.dtype if like.is_floating_point() else torch.float32
+            new = torch.from_numpy(columns[name]).to(like.device, dtype)
+            # Scores of keypoints keep their gradients.
+            result[name] = (
+                torch.cat((new, like[..., 2:].to(new)), -1) if name == "keypoints" else new
+            )
         if "masks" in result:
             result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile_of), remap)
         results.append(result)
@@ -129,6 +136,9 @@ def _rows(detections: Mapping[str, Tensor]) -> dict[str, Tensor]:
         raise ValueError(
             f"detections must be boxes (K, 4 or 5), scores (K,), labels (K,), got {shapes}"
         )
+    shape = tuple(detections["keypoints"].shape) if "keypoints" in detections else (count, 0, 2)
+    if shape[0] == count and (len(shape) != 3 or shape[2] not in (2, 3)):
+        raise ValueError(f"keypoints must have shape (K, P, 2 or 3), got {shape}")
     return {
         name: value for name, value in detections.items()
         if isinstance(value, Tensor) and value.dim() and len(value) == count

@@ -21,6 +21,7 @@ import numpy as np
 
 from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask
+from darswin.boxes.turned import as_turned
 from darswin.data.cameras import Calibrations
 from darswin.data.labels.labels import (
     LabelledPictures,
@@ -173,6 +174,7 @@ def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
     are not known or not shown are 0, 0, 0.
     """
     more, areas, labels = instances.more, instances.areas.tolist(), instances.labels.tolist()
+    turns = np.degrees(as_turned(instances.boxes)[:, 4]).tolist()
     annotations = []
     for k, (x0, y0, x1, y1) in enumerate(instances.upright):
         annotation: dict[str, Any] = dict(more["entry"][k]) if "entry" in more else {}
@@ -190,9 +192,10 @@ def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
         elif instances.outlines is not None and len(instances.outlines[k]):
             outline = instances.outlines[k]
             annotation["segmentation"] = [_rounded(polygon.ravel()) for polygon in outline]
-        if instances.boxes.shape[1] == 5 and (angle := instances.boxes[k, 4]):
-            turn = {"rotation": round(math.degrees(angle) % 360, _SHARE_DIGITS)}
-            annotation["attributes"] = {**(annotation.get("attributes") or {}), **turn}
+        if degrees := round(turns[k] % 360, _SHARE_DIGITS) % 360:
+            attributes = annotation.get("attributes")
+            attributes = attributes if isinstance(attributes, Mapping) else {}
+            annotation["attributes"] = {**attributes, "rotation": degrees}
             outline = corners(instances.boxes[k, None])
             annotation.setdefault("segmentation", [_rounded(outline.ravel())])
         if instances.keypoints is not None:
@@ -306,8 +309,11 @@ def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> In
     if is_crowd is None:
         raise ValueError(f"has iscrowd {annotation['iscrowd']!r}, which must be 0 or 1")
     entry = {name: value for name, value in annotation.items() if name not in _OWN}
-    if rle is None and isinstance(attributes := entry.get("attributes"), Mapping):
-        degrees = _numbers("rotation", attributes.get("rotation") or 0, 1)[0, 0]
+    attributes = entry.get("attributes")
+    attributes = attributes if isinstance(attributes, Mapping) else {}
+    rotation = attributes.get("rotation")
+    if rle is None and rotation and (not polygons or isinstance(rotation, int | float)):
+        degrees = _numbers("rotation", rotation, 1)[0, 0]
         turned = _turned(box, polygons, math.radians(degrees)) if degrees else None
         if turned is not None:
             box, polygons = turned, []

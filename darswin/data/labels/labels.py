@@ -1,7 +1,7 @@
 """The labels of a picture, which move with it, and the pictures of a data set."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,8 +45,9 @@ def labelled(
     if keypoints is not None:
         keypoints = keypoints.copy()[None]
         keypoints[keypoints[..., 2] == 0, :2] = np.nan
+    is_int = isinstance(label, int) and abs(label) < 2**63
     return Instances(
-        box[None], labels=np.array([label], None if isinstance(label, int) else object),
+        box[None], labels=np.array([label], int if is_int else object),
         keypoints=keypoints, masks=[mask], outlines=[outline],
         more={
             "crowd": np.array([crowd]), "visible": np.array([visible], float), "mirror": [mirror],
@@ -85,7 +86,17 @@ def moved(labels: Labels, remap: Remap) -> Labels:
 
 def move_instances(instances: Instances, remap: Remap) -> Instances:
     """Each of the instances in the picture of a view, with what is visible of it, also if it is
-    nothing."""
+    nothing. Among turned boxes, those with the angle 0 are upright, and stay so."""
+    if instances.boxes.shape[1] == 5:
+        is_turned = instances.boxes[:, 4] != 0
+        others = instances[~is_turned]
+        parts = [instances[is_turned], replace(others, boxes=others.upright)]
+        new = [_move(part, remap) for part in parts]
+        return Instances.joined(new)[np.argsort(np.argsort(~is_turned, kind="stable"))]
+    return _move(instances, remap)
+
+
+def _move(instances: Instances, remap: Remap) -> Instances:
     instances = instances.through(
         remap.to_view, remap.view_size,
         masks=lambda mask: remap.target(mask.astype(np.uint8)) == 1,
@@ -93,7 +104,8 @@ def move_instances(instances: Instances, remap: Remap) -> Instances:
     if remap.mirrored and instances.keypoints is not None:
         orders = instances.more.get("mirror", [()] * len(instances))
         for points, order in zip(instances.keypoints, orders, strict=True):
-            points[: len(order)] = points[list(order)]
+            if len(order) <= len(points):  # or the instance has no keypoints
+                points[: len(order)] = points[list(order)]
     return instances
 
 

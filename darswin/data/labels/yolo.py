@@ -89,7 +89,7 @@ def write_yolo(
         if "crowd" in instances.more:
             instances = instances[~instances.more["crowd"]]
         if instances.keypoints is not None and len(instances):
-            shape = [instances.keypoints.shape[1], 3]
+            shape = [max(instances.keypoints.shape[1], shape[0] if shape else 0), 3]
         classes = [number[label] for label in check_labels(instances, number)]
         lines = yolo_lines(replace(instances, labels=np.array(classes)), labels.size)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))

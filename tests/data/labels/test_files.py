@@ -228,6 +228,7 @@ def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):
         dict(segmentation=[[10, 20, 40, 35]]), dict(segmentation=[[10, 20, 20, 20, 40, 20]]),
         dict(segmentation=encode_rle(0 * MASK)), dict(bbox=["10", "20", "30", "15"]),
         dict(iscrowd="0"), dict(iscrowd=None), dict(attributes={"rotation": 0.0}),
+        dict(attributes=["rotation"]), dict(attributes={"rotation": None}),
     ],
 )  # fmt: skip
 def test_what_is_no_outline_is_the_box(tmp_path, changes):

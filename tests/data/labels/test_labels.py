@@ -138,6 +138,18 @@ def test_keypoints():
     )
 
 
+def test_boxes_and_keypoints_of_other_forms_move_as_if_they_were_alone():
+    alone = labelled(1, np.array([95.0, 15, 125, 35]), mirror=[1, 0, 2])
+    box, points = np.array([40.0, 60, 30, 20, 0.5]), np.ones((2, 3))
+    turned = labelled(2, box, keypoints=points, mirror=[0, 1])
+    for way in ("mirrored", "other lens"):
+        remap = WAYS[way].at(LENS, SIZE)
+        both, *_ = moved(Labels(Instances.joined([alone, turned]), SIZE), remap)
+        assert both.labels.tolist() == [1, 2] and both.boxes[0, 4] == 0 != both.boxes[1, 4]
+        expected, *_ = moved(Labels(alone, SIZE), remap)
+        np.testing.assert_allclose(both.upright[0], expected.boxes[0])
+
+
 # A view all around of 100 px: what leaves it on one side is on the other.
 SHIFTED = SimpleNamespace(
     view_size=(80, 100),
