@@ -180,7 +180,8 @@ def draw_boxes(
 def draw_instances(image: np.ndarray, instances: Instances, texts: Sequence[str]) -> np.ndarray:
     """Draws boxes with their texts, masks and keypoints on an image (H, W, 1 or 3) uint8: (H, W, 3)
     uint8. Masks are run lengths, and the colours those of the labels."""
-    colors = [palette(MOST_CLASSES)[label % MOST_CLASSES] for label in instances.labels.tolist()]
+    of_label = palette(MOST_CLASSES)
+    colors = [of_label[label % MOST_CLASSES] for label in instances.labels.tolist()]
     picture = with_channels(image, 3)
     if instances.masks is not None:
         laid, where = np.zeros_like(picture), np.zeros(picture.shape[:2], bool)
