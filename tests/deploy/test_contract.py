@@ -11,15 +11,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from frame_samples import (
-    MEAN,
-    ROUND,
-    STD,
-    model_of,
-    network_of,
-    random_frame,
-    size_of,
-)
+from frame_samples import MEAN, ROUND, STD, model_of, network_of, random_frame, size_of
 from helpers import network, products, refused, relative_error, slow, slow_but
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode

@@ -5,16 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from frame_samples import (
-    LAYOUTS,
-    MEAN,
-    ROUND,
-    STD,
-    in_layout,
-    model_of,
-    network_of,
-    random_frame,
-)
+from frame_samples import LAYOUTS, MEAN, ROUND, STD, in_layout, model_of, network_of, random_frame
 from helpers import refused
 
 from darswin import frames
