@@ -136,11 +136,19 @@ class Instances:
         """px², of the masks, the outlines, or else the boxes, (K,)."""
         areas = np.prod(as_turned(self.boxes)[:, 2:4], axis=1)
         for k in range(len(self)):
-            if self.masks is not None and self.masks[k] is not None:
-                areas[k] = decode_rle(self.masks[k]).sum()
-            elif self.outlines is not None and len(self.outlines[k]):
-                areas[k] = sum(map(area_of, self.outlines[k]))
+            if (mask := self.mask_of(k)) is not None:
+                areas[k] = decode_rle(mask).sum()
+            elif len(outline := self.outline_of(k)):
+                areas[k] = sum(map(area_of, outline))
         return areas
+
+    def mask_of(self, row: int) -> Mapping[str, Any] | None:
+        """The run lengths of the mask of an instance; None if it is not known."""
+        return None if self.masks is None else self.masks[row]
+
+    def outline_of(self, row: int) -> Sequence[np.ndarray]:
+        """The parts (P, 2) of the outline of an instance; none if it is not known."""
+        return () if self.outlines is None else self.outlines[row]
 
     def through(
         self, points_map: PointMap, size: Size, *, cut: Size | None = None,

@@ -60,9 +60,11 @@ class File(NamedTuple):
             BrokenImageError: the file cannot be read, or has no lens that fits.
         """
 
+        said = self.said
+
         def picture(entry: dict[str, Any], image: np.ndarray, orientation: int) -> Picture:
             try:
-                lens = lenses.lens_of(self.said, (image.shape[0], image.shape[1]), orientation)
+                lens = lenses.lens_of(said, (image.shape[0], image.shape[1]), orientation)
             except ValueError as error:
                 raise BrokenImageError(with_flags(error)) from error
             return Picture(entry, image, lens)
@@ -76,7 +78,7 @@ class File(NamedTuple):
         read = read_stream if is_stream(self.name) else read_frames
         for frame in read(self.name, channels or 3, every):
             time = round(frame.time, 6)
-            entry = {"video": self.said, "frame": frame.number, "time": time}
+            entry = {"video": said, "frame": frame.number, "time": time}
             yield picture(entry, frame.image, frame.orientation)
 
 

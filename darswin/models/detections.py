@@ -10,6 +10,7 @@ from torch import Tensor
 from darswin.boxes import Instances
 from darswin.models.prepared import Prepared
 from darswin.views import PixelView, Remap, View
+from darswin.views.remap import tensor_like
 
 NAMES = ("boxes", "scores", "labels")
 
@@ -107,19 +108,12 @@ def detections_to_images(
         rows = torch.from_numpy(starts[tile_of] + row_of)
         result = {name: torch.cat([tile[name] for tile in tiles]) for name in names}
         result = {name: column[rows.to(column.device)] for name, column in result.items()}
-        columns = {"boxes": moved.boxes, **moved.more}
-        if "keypoints" in result:
-            columns["keypoints"] = moved.keypoints[..., :2]
-        for name in ("boxes", "visible", "rays", "keypoints"):
-            if name not in columns:
-                continue
-            like = result.get(name, result["boxes"])
-            dtype = like.dtype if like.is_floating_point() else torch.float32
-            new = torch.from_numpy(columns[name]).to(like.device, dtype)
-            # Scores of keypoints keep their gradients.
-            result[name] = (
-                torch.cat((new, like[..., 2:].to(new)), -1) if name == "keypoints" else new
-            )
+        if (points := result.get("keypoints")) is not None:  # scores keep their gradients
+            places = tensor_like(points, moved.keypoints[..., :2])
+            result["keypoints"] = torch.cat((places, points[..., 2:].to(places)), -1)
+        for name, column in {"boxes": moved.boxes, **moved.more}.items():
+            if name != "source":
+                result[name] = tensor_like(result.get(name, result["boxes"]), column)
         if "masks" in result:
             result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile_of), remap)
         results.append(result)

@@ -1,7 +1,7 @@
 """A view bound to one camera: the map between the camera's pictures and what the view shows."""
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -26,6 +26,12 @@ Points = TypeVar("Points", np.ndarray, Tensor)
 
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a picture is on it
 _NUDGE = 1e-3  # px, more than the rounding of points in float32
+
+
+def tensor_like(like: Tensor, values: np.ndarray) -> Tensor:
+    """The values as a tensor on the device of another one, in its floating type or else float32."""
+    dtype = like.dtype if like.is_floating_point() else torch.float32
+    return torch.as_tensor(values, dtype=dtype, device=like.device)
 
 
 class Remap:
@@ -161,9 +167,9 @@ class Remap:
         columns = moved.boxes, moved.more["visible"], moved.more.get("rays")
         if not isinstance(boxes, Tensor):
             return columns
-        dtype = boxes.dtype if boxes.is_floating_point() else torch.float32
-        like = partial(torch.as_tensor, dtype=dtype, device=boxes.device)
-        return like(columns[0]), like(columns[1]), None if columns[2] is None else like(columns[2])
+        there, visible, of_rays = columns
+        rays_there = None if of_rays is None else tensor_like(boxes, of_rays)
+        return tensor_like(boxes, there), tensor_like(boxes, visible), rays_there
 
     def _moved(self, points: Points, move: Callable[[Tensor], Tensor]) -> Points:
         if (shape := tuple(np.shape(points)))[-1:] != (2,):

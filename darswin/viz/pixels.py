@@ -48,6 +48,9 @@ _MORE = (
     "7b7c94608947d88caa85c0dd65ef9350e0446ae811dd79be13c00c54c72bd6fb50713b86c28db9b5b48315432dee9"
     "fc4f2ce39af8d68d95f69e8d99564ec9ce62b55442474176fe5e5d2a2363562f96a79ffa510e3e8e9ae1ceb3e6672"
 )  # fmt: skip
+_COLORS = (*_FIRST, *(
+    tuple(17 * int(level, 16) for level in _MORE[k : k + 3]) for k in range(0, len(_MORE), 3)
+))  # fmt: skip
 
 Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # image (H, W, 1 or 3) uint8, truth, prediction
 # Pictures of truth, prediction and error, and the error in words.
@@ -66,8 +69,7 @@ def palette(count: int) -> list[list[int]]:
     """
     if not 0 <= count <= MOST_CLASSES:
         raise ValueError(f"a palette has 0 to {MOST_CLASSES} colours, got {count}")
-    more = ([17 * int(level, 16) for level in _MORE[k : k + 3]] for k in range(0, len(_MORE), 3))
-    return [*map(list, _FIRST), *more][:count]
+    return [*map(list, _COLORS[:count])]
 
 
 def label_image(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> np.ndarray:

@@ -143,8 +143,9 @@ def write_coco(
         ValueError: an instance has no label or that of no category, or its box is NaN because its
             picture does not show it.
     """
+    known = {category["id"] for category in categories}
     for _, labels in pictures:
-        check_labels(labels.instances, {category["id"] for category in categories})
+        check_labels(labels.instances, known)
     entries = [
         {**entry, "height": labels.size[0], "width": labels.size[1]} for entry, labels in pictures
     ]
@@ -187,22 +188,19 @@ def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
             annotation["visible"] = round(float(more["visible"][k]), _SHARE_DIGITS)
         if instances.scores is not None:
             annotation["score"] = round(float(instances.scores[k]), _SHARE_DIGITS)
-        if instances.masks is not None and instances.masks[k] is not None:
-            annotation["segmentation"] = instances.masks[k]
-        elif instances.outlines is not None and len(instances.outlines[k]):
-            outline = instances.outlines[k]
+        if (mask := instances.mask_of(k)) is not None:
+            annotation["segmentation"] = mask
+        elif len(outline := instances.outline_of(k)):
             annotation["segmentation"] = [_rounded(polygon.ravel()) for polygon in outline]
         if degrees := round(turns[k] % 360, _SHARE_DIGITS) % 360:
             attributes = annotation.get("attributes")
             attributes = attributes if isinstance(attributes, Mapping) else {}
             annotation["attributes"] = {**attributes, "rotation": degrees}
-            outline = corners(instances.boxes[k, None])
-            annotation.setdefault("segmentation", [_rounded(outline.ravel())])
-        if instances.keypoints is not None:
-            points = known_keypoints(instances.keypoints[k])
-            if len(points):
-                annotation["keypoints"] = _rounded(points.ravel())
-                annotation["num_keypoints"] = int((points[:, 2] > 0).sum())
+            points = corners(instances.boxes[k, None])
+            annotation.setdefault("segmentation", [_rounded(points.ravel())])
+        if len(points := known_keypoints(instances, k)):
+            annotation["keypoints"] = _rounded(points.ravel())
+            annotation["num_keypoints"] = int((points[:, 2] > 0).sum())
         annotations.append(annotation)
     return annotations
 

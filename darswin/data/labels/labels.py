@@ -56,9 +56,12 @@ def labelled(
     )  # fmt: skip
 
 
-def known_keypoints(points: np.ndarray) -> np.ndarray:
-    """The keypoints of one instance, (P, 2 or 3), as files have them, (P', 3): 0, 0, 0 if they are
-    unknown or not shown, without the rows that fill up the column."""
+def known_keypoints(instances: Instances, row: int) -> np.ndarray:
+    """The keypoints of an instance as files have them, (P, 3): 0, 0, 0 if they are unknown or not
+    shown, without the rows that fill up the column."""
+    if instances.keypoints is None:
+        return np.zeros((0, 3))
+    points = instances.keypoints[row]
     points = np.column_stack((points, np.ones(len(points))))[:, :3]
     points = points[: np.flatnonzero(~np.isnan(points[:, 2])).max(initial=-1) + 1]
     return np.where(np.isfinite(points).all(1, keepdims=True), points, 0.0)

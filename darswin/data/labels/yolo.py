@@ -111,10 +111,9 @@ def yolo_lines(instances: Instances, size: Size) -> str:
     lines = []
     for k, (low, high) in enumerate(upright):
         numbers = np.stack(((low + high) / 2, high - low)) / sides
-        points = None if instances.keypoints is None else known_keypoints(instances.keypoints[k])
-        if points is not None and len(points):
+        if len(points := known_keypoints(instances, k)):
             numbers = np.concatenate((numbers.ravel(), (points / [*sides, 1.0]).ravel()))
-        elif outline := _outline(instances, k):
+        elif len(outline := _outline(instances, k)):
             numbers = _one_part(outline) / sides
         elif instances.boxes.shape[1] == 5 and instances.boxes[k, 4]:
             numbers = corners(instances.boxes[k, None])[0] / sides
@@ -126,10 +125,10 @@ def yolo_lines(instances: Instances, size: Size) -> str:
 
 def _outline(instances: Instances, row: int) -> Sequence[np.ndarray]:
     """The parts of the outline of an instance, or of its mask; none if it has neither."""
-    if instances.masks is None or instances.masks[row] is None:
-        return () if instances.outlines is None else instances.outlines[row]
-    mask = decode_rle(instances.masks[row]).astype(np.uint8)
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if (mask := instances.mask_of(row)) is None:
+        return instances.outline_of(row)
+    pixels = decode_rle(mask).astype(np.uint8)
+    outlines, _ = cv2.findContours(pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     outlines = [outline.reshape(-1, 2) + 0.5 for outline in outlines]
     return [outline for outline in outlines if area_of(outline) > NO_AREA]
 
