@@ -46,11 +46,14 @@ def with_nearest(message: str, *names: Collection[str]) -> str:
 
 
 def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog: str) -> None:
-    """Calls a function with the arguments in `argv`. Of several functions, `argv` names one first.
+    """Calls a function with the arguments in `argv`. Of several functions, `argv` names one first;
+    or, if their names are options, the one whose option is in `argv`, and otherwise that of "".
 
     Keyword-only parameters are options; the others are positional. The annotations define which
     values are valid. The help consists of the docstring: its text and its section `Args`.
     """
+    if isinstance(commands, dict) and "" in commands:
+        commands = _by_option(commands, [word.partition("=")[0] for word in argv])
     if isinstance(commands, dict):
         if argv and argv[0] in commands:
             run_command(commands[argv[0]], argv[1:], f"{prog} {argv[0]}")
@@ -90,6 +93,18 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
             except (ValueError, KeyError, yaml.YAMLError):
                 parser.error(f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}")
     commands(**given)
+
+
+def _by_option(commands: dict[str, Callable], words: list[str]) -> Callable:
+    """The function whose option is among `words`; ValueError for an option of another function."""
+    chosen = next((o for o in commands if any(o.startswith(w) for w in words if w[2:])), "")
+    own = inspect.signature(commands[chosen]).parameters
+    for option, function in commands.items():
+        for name in inspect.signature(function).parameters:
+            if f"--{name}" in words and name not in own:
+                goes = f"is an option of {option}" if option else f"does not go with {chosen}"
+                raise ValueError(f"--{name} {goes}")
+    return commands[chosen]
 
 
 def check_out(

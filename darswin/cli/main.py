@@ -46,7 +46,7 @@ COMMANDS = {
     "predict": Command(
         "predicts classes, or a class or a distance for every pixel; or runs any ONNX network",
         PICTURES,
-        "darswin.cli.predict:predict",
+        "darswin.cli.predict:COMMANDS",
     ),
     "quantize": Command(
         "converts a trained model to 8 bits, for faster inference on CPUs",

@@ -4,45 +4,39 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from darswin.cli.answers import ANSWERS_OF, TOP, Answers, ClassAnswers
 from darswin.cli.arguments import check_out
-from darswin.cli.lenses import given_lenses, lenses_of_run
+from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
 from darswin.cli.options import check_folder
 from darswin.cli.pictures import Broken, File, check_paths, claim_folder, file_names, files_at
 from darswin.compat import load_official
 from darswin.data.cameras import Calibrations
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
-from darswin.frames.recognise import TASKS
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, naming
+from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_stream
 
 ANSWERS = "predictions.json"
-AnyTask = Literal["classification", "segmentation", "distance", "detect", "pose", "obb", "segment"]
 
 
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
     model: str | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None, task: AnyTask | None = None, top: int | None = None,
-    every: int = 1, out: str | None = None, network: str | None = None, view: str | None = None,
-    size: tuple[int, int] | None = None, fov_deg: float | None = None,
-    up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
-    std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
-    threshold: float | None = None, labels: str | None = None,
-    scores: Literal["softmax", "sigmoid"] | None = None,
-    height: float | None = None, radius: float | None = None,
-    format: Literal["json", "coco", "yolo"] | None = None,
+    coefficients: Coefficients | None = None, task: Task | None = None, top: int | None = None,
+    every: int = 1, out: str | None = None,
 ) -> list[dict]:  # fmt: skip
-    """Predicts classes, or a class or a distance for every pixel, of pictures and video frames;
-    or runs any network in an ONNX file, such as a detector, on a view of them.
+    """Predicts classes, or a class or a distance for every pixel, of pictures and video frames.
+    `darswin predict --network FILE.onnx --help` lists the options for any network in an ONNX file,
+    such as a detector.
 
     Prints the most probable classes as JSON, or writes picture files. Pictures and videos are
     turned upright by their metadata, and their lens with them. If some files cannot be read, the
@@ -68,21 +62,71 @@ def predict(
             classes are numbers.
         camera: the name or number of the camera, if the calibration has several.
         coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
-        task: the task that the model must have. Another model is an error. Of a network of
-            Ultralytics whose file lost its metadata: detect, pose, obb or segment.
-        top: the number of classes to list for each image. The default is 5. A network in an ONNX
-            file then gives classes in place of numbers.
+        task: the task that the model must have. Another model is an error.
+        top: the number of classes to list for each image. The default is 5.
         every: the step between the frames of a video that are predicted; 1 predicts all.
         out: the JSON file to write; without it, classes are printed. For segmentation and
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
-            in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json. For a
-            network, it gets overlays/NAME.jpg with what was found, or maps/OUTPUT/NAME.npy, and
-            predictions.json; the numbers of a network without boxes and maps are printed.
-        network: in place of a run, an ONNX file of any network: a detector as the exporters of
+            in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
+    """
+    if (run is None) == (model is None):
+        raise ValueError(
+            "give either --run, the folder of a run, or --model, a safetensors file or one of "
+            + ", ".join(list_pretrained())
+            + ", or --network, an ONNX file"
+        )
+    if run is not None:
+        check_folder(Path(run), {".safetensors": "--model takes a model"})
+        weights: str | Path = model_of_run(run)
+    else:
+        assert model is not None
+        weights = Path(model_file(model))
+    if not paths and lens is None and model in list_pretrained():
+        paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
+    _check(paths, lens or run, top, every)
+    net, card = trained_model(weights)
+    if task not in (None, card.task):
+        raise ValueError(f"--task is {task}, but {weights} is a model for {card.task}")
+
+    def answers_in(folder: Path | None, names: Mapping[str, str]) -> Answers:
+        if folder is None:
+            return ClassAnswers(net, card, TOP if top is None else top)
+        return ANSWERS_OF[card.task](net, card, folder, names)
+
+    def lenses_of(names: Sequence[str]) -> Lenses:
+        if lens is not None:
+            return given_lenses(lens, camera, coefficients, names)
+        return lenses_of_run(str(run), camera, coefficients, names)
+
+    read = [str(weights), *([] if lens is None else [lens])]
+    return _predict(paths, card.task, answers_in, lenses_of, read, top, every, out)
+
+
+def predict_network(
+    paths: Sequence[str] = (), *, network: str, lens: str | None = None,
+    camera: str | None = None, coefficients: Coefficients | None = None,
+    view: str | None = None, size: tuple[int, int] | None = None, fov_deg: float | None = None,
+    up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
+    std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
+    threshold: float | None = None, labels: str | None = None, top: int | None = None,
+    task: Literal["detect", "pose", "obb", "segment"] | None = None,
+    scores: Literal["softmax", "sigmoid"] | None = None,
+    height: float | None = None, radius: float | None = None,
+    format: Literal["json", "coco", "yolo"] | None = None, every: int = 1, out: str | None = None,
+) -> list[dict]:  # fmt: skip
+    """Runs any network in an ONNX file, such as a detector, on a view of pictures and video frames,
+    and gives its results in the pictures. `darswin predict --help` lists the options for models.
+
+    Args:
+        paths: image files, videos, folders, and cameras, as of models.
+        network: an ONNX file: a detector as the exporters of
             YOLO, RT-DETR, RF-DETR, DETR, torchvision and others write it, with masks, keypoints and
             turned boxes; maps (B, K, H, W) of the size of the view or of a whole fraction of it; or
             numbers (B, K). It needs onnxruntime, of the extra onnx.
+        lens: the calibration of the camera, or of several, as of models.
+        camera: the name or number of the camera, if the calibration has several.
+        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         view: what the network sees of the pictures, by its lens: the name of a view of
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
@@ -102,73 +146,71 @@ def predict(
             class k, from 0, and whose empty lines are no classes; JSON or YAML with a list or with
             {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt). The default
             is the names in the file of the network, if it has any.
+        top: the number of classes to list for each image, if the network gives numbers of classes.
+        task: of a network of Ultralytics whose file lost its metadata.
         scores: what makes probabilities of the logits of a DETR of transformers, if no config.json
             is beside the file.
-        format: what else to write of detections, beside predictions.json: coco writes coco.json,
-            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, place and
-            score in each line.
         height: of the camera above a flat floor, in metres. Each detection then tells where it
             stands: "floor" is metres to the right and ahead of the camera. It needs `up`.
         radius: of things on the floor, in metres: 0.25 suits people. The default is 0, for their
             nearest points.
+        format: what else to write of detections, beside predictions.json: coco writes coco.json,
+            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, place and
+            score in each line.
+        every: the step between the frames of a video that are predicted; 1 predicts all.
+        out: a folder that is new, empty, or from an earlier predict. It gets predictions.json and
+            overlays/NAME.jpg with the detections, or maps/OUTPUT/NAME.npy. For a network without
+            boxes and maps, the JSON file to write; without it, its numbers are printed.
     """
-    options: dict[str, Any] = {
-        "view": view, "size": size, "fov_deg": fov_deg, "up": up, "mean": mean, "std": std,
-        "channels": channels, "threshold": threshold, "labels": labels, "scores": scores,
-        "height": height, "radius": radius, "format": format,
-    }  # fmt: skip
-    if network is None and (typed := [k for k, value in options.items() if value is not None]):
-        raise ValueError(f"--{typed[0]} is an option of --network, an ONNX file")
-    if sum(weights is not None for weights in (run, model, network)) != 1:
-        raise ValueError(
-            "give either --run, the folder of a run, or --model, a safetensors file or one of "
-            + ", ".join(list_pretrained())
-            + ", or --network, an ONNX file"
-        )
-    if run is not None:
-        check_folder(Path(run), {".safetensors": "--model takes a model"})
-        weights: str | Path = model_of_run(run)
-    elif model is not None:
-        weights = Path(model_file(model))
-    else:
-        assert network is not None
-        weights = network
+    _check(paths, lens, top, every)
+    from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
+
+    answers = NetworkAnswers(
+        network, view=view, size=size, fov_deg=fov_deg, up=up, mean=mean, std=std,
+        channels=channels, threshold=threshold, labels=labels, top=top, task=task, scores=scores,
+        height=height, radius=radius, format=format,
+    )  # fmt: skip
+    kind = answers.network.kind
+    if task is not None and kind != "detections":
+        raise ValueError(f"--task is {task}, but {network} is a model for {kind}")
+    lenses_of = partial(given_lenses, str(lens), camera, coefficients)
+    read = [network, str(lens)]
+    return _predict(paths, kind, answers.into, lenses_of, read, top, every, out)
+
+
+COMMANDS = {"": predict, "--network": predict_network}
+
+
+def _check(paths: Sequence[str], lens: str | None, top: int | None, every: int) -> None:
+    """ValueError for arguments that cannot be right, before a model is read."""
     for name, value in (("top", top), ("every", every)):
         check(name, value, value is None or value >= 1, "at least 1")
-    if not paths and lens is None and model in list_pretrained():
-        paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
-    if lens is None and run is None:
+    if lens is None:
         raise ValueError("missing --lens: give the camera's calibration file")
-    check_paths(path for path in paths if not is_stream(path))  # before a model is read
-    if network is None:
-        kind, make = _of_model(weights, TOP if top is None else top)
-    else:
-        from darswin.cli.network import NetworkAnswers  # needs the compiled part of frames
+    check_paths(path for path in paths if not is_stream(path))
 
-        told = task if task in TASKS else None
-        through = NetworkAnswers(network, **options, top=top, task=told)
-        kind, make = through.network.kind, through.into
-        task = None if told and kind == "detections" else task
-    if task not in (None, kind):
-        raise ValueError(f"--task is {task}, but {weights} is a model for {kind}")
+
+def _predict(
+    paths: Sequence[str], kind: str,
+    answers_in: Callable[[Path | None, Mapping[str, str]], Answers],
+    lenses_of: Callable[[Sequence[str]], Lenses],
+    read: Sequence[str], top: int | None, every: int, out: str | None,
+) -> list[dict]:  # fmt: skip
+    """Predicts all files, and writes or prints the entries. `answers_in` takes the folder and the
+    names of files, `lenses_of` the paths; `read` names the files of the model and of its lens."""
     prints = kind in ("classification", "numbers")
     if top is not None and not prints:
-        text = f"`top` is for the classes of pictures, but {weights} is a model for {kind}"
+        text = f"`top` is for the classes of pictures, but {read[0]} is a model for {kind}"
         raise naming(ValueError(text), "top")
     files = files_at(paths, leave_out=None if prints else out, streams=True)
     names = [file.said for file in files]
-    read = [*names, str(weights), *([] if lens is None else [lens])]
-    check_out(out, read, may_be_folder=not prints)
-    if lens is not None:
-        lenses = given_lenses(lens, camera, coefficients, names)
-    else:
-        assert run is not None
-        lenses = lenses_of_run(run, camera, coefficients, names)
+    check_out(out, [*names, *read], may_be_folder=not prints)
+    lenses = lenses_of(names)
     folder = None if prints else claim_folder(out, ANSWERS)
     out = out if folder is None else str(folder / ANSWERS)
-    answers = make(folder, file_names(paths, files))
+    answers = answers_in(folder, file_names(paths, files))
     broken = Broken()
     try:
         for file in files:
@@ -189,20 +231,6 @@ def predict(
     count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
     broken.report(count if entries else "")
     return entries
-
-
-def _of_model(
-    weights: str | Path, top: int
-) -> tuple[str, Callable[[Path | None, Mapping[str, str]], Answers]]:
-    """The task of a model, and what makes its answers, for a folder and the names of files."""
-    net, card = trained_model(weights)
-
-    def make(folder: Path | None, names: Mapping[str, str]) -> Answers:
-        if folder is None:
-            return ClassAnswers(net, card, top)
-        return ANSWERS_OF[card.task](net, card, folder, names)
-
-    return card.task, make
 
 
 def answer(file: File, lenses: Calibrations, every: int, answers: Answers) -> None:

@@ -35,7 +35,7 @@ REFUSED = {
         none.png --lens lens.json => give either --run, .* or --model, a safetensors file or one of
         p.png --model digits --run . => or --model, a safetensors file or one of digits
         p.png --model digits => missing --lens: give the camera
-        p.png --model digits --view mercator => --view is an option of --network, an ONNX file
+        p.png --model digits --view mercator => --view is an option of --network$
         p.png --model digits --labels l.txt => --labels is an option of --network
         --lens lens.json --run . => missing pictures or videos
         checkpoints --run . --lens lens.json => no pictures or videos in checkpoints
@@ -62,8 +62,8 @@ REFUSED = {
         --run checkpoints/best.safetensors --lens lens.json => the folder .* a file. --model takes
         --network n.onnx => missing --lens
         --network n.onnx --lens lens.json => missing --out
-        --network n.onnx --model digits => give either --run, .* or --network, an ONNX file
-        --network n.onnx --run r => give either --run, .* or --network, an ONNX file
+        --network n.onnx --model digits => --model does not go with --network$
+        --netw n.onnx --run=r => --run does not go with --network$
         --network n.onnx --channels grb => --channels must be one of rgb, bgr, got grb
         --network n.onnx --fov_deg wide => --fov_deg must be a number, got wide
     """,
@@ -85,7 +85,8 @@ REFUSED = {
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be finite, got nan
         n.onnx --labels gone.txt => gone.txt
-        n.onnx --task distance => --task is distance, but n.onnx is a model for detec
+        n.onnx --task distance => --task must be one of detect, pose, obb, segment, got dis
+        maps.onnx --task pose => --task is pose, but maps.onnx is a model for maps
         n.onnx --height 2 => --height needs --up, the direction away from gravity
         n.onnx --radius 1 => --radius must be given with --height, got 1.0
         n.onnx --height 2 --radius -1 --up=0,-1,0 => --radius must be at least 0 m
