@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,19 +37,20 @@ def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> 
     z is `direction`, and x is level. If the view is `upright`, y is straight down, and z is the
     level part of `direction`. Where `direction` is straight up or down, the picture's top is level.
     """
-    above, ahead = torch.tensor([up, direction], dtype=torch.float64)
-    right = torch.linalg.cross(ahead, above)
-    if right.norm() < 1e-6:
-        ahead_of_level = torch.tensor(PICTURE_TOP, dtype=torch.float64)
-        if torch.linalg.cross(ahead_of_level, above).norm() < 1e-6:
-            ahead_of_level = torch.tensor(AXIS, dtype=torch.float64)
-        right = torch.linalg.cross(ahead_of_level, above)
+    # Arrays: on torch's "meta" device, tensors have no values.
+    above, ahead = np.array([up, direction], np.float64)
+    right = np.cross(ahead, above)
+    if np.linalg.norm(right) < 1e-6:
+        ahead_of_level = np.array(PICTURE_TOP)
+        if np.linalg.norm(np.cross(ahead_of_level, above)) < 1e-6:
+            ahead_of_level = np.array(AXIS)
+        right = np.cross(ahead_of_level, above)
     axis = above if upright else ahead
     right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
-    right = right / right.norm()
-    down = -above if upright else torch.linalg.cross(ahead, right)
-    forward = torch.linalg.cross(right, down) if upright else ahead
-    return torch.stack((right, down, forward), 1).tolist()
+    right = right / np.linalg.norm(right)
+    down = -above if upright else np.cross(ahead, right)
+    forward = np.cross(right, down) if upright else ahead
+    return np.stack((right, down, forward), 1).tolist()
 
 
 def up_of(

@@ -28,7 +28,7 @@ from darswin.views.base import (
     check_seen_images,
     in_full_precision,
 )
-from darswin.views.polar_back import nearest, places_of, resized_around, shown_by
+from darswin.views.polar_back import from_edges, nearest, places_of, resized_around, shown_by
 from darswin.views.registry import register_view
 
 Layout = Literal["tokens", "image"]
@@ -124,14 +124,18 @@ class PolarView(View):
         grid = self.grid(lens, size)
         if not back:
             return PreparedPolar(size, grid)
-        pixels = self.pixel_grid(lens, size, self._split(back))
+        # Images of another size are resized.
+        maps = self.map_size if self.in_pixels or isinstance(back, bool) else back
+        pixels = self.pixel_grid(lens, size, maps)
         return PreparedPolar(size, grid, pixels, shown_by(pixels, size))
 
     @in_full_precision
     def ray_channels(self, lens: Lens | None, size: Pair) -> Tensor:
         lens = check_lens(lens, size)
         if self.in_pixels:
-            return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
+            steps_r, steps_phi = self._steps(lens)
+            rays = _rays(self._rings(lens, steps_r).angles, _azimuths(self.sectors, steps_phi))
+            return rays.permute(0, 3, 1, 2)
         return ray_channels(*self._rays or pixel_rays(lens, size))
 
     @in_full_precision
@@ -170,7 +174,10 @@ class PolarView(View):
         assert prepared.back is not None and prepared.shown is not None
         *lens, plan = prepared.back
         if self.in_pixels:
-            maps = resized_around(maps, self.map_size).permute(0, 2, 3, 1)
+            maps = resized_around(maps, self.map_size)
+            if self.placement == "edges" and maps.is_floating_point():
+                maps = from_edges(maps, self.samples)
+            maps = maps.permute(0, 2, 3, 1)
         if not maps.is_floating_point():
             places = places_of(maps)
             if self.in_pixels:
@@ -210,12 +217,6 @@ class PolarView(View):
             return self.rings, self.sectors
         return self.rings * self.samples[0], self.sectors * self.samples[1]
 
-    def _split(self, back: bool | Pair) -> int:
-        """The number of rings, per ring here, of the maps that go back."""
-        if self.in_pixels or isinstance(back, bool):  # images of another size are resized
-            return self.map_size[0] // self.rings
-        return back[0] // self.rings
-
     @property
     def inner_spacing(self) -> Spacing:
         """`sample_spacing`, or `spacing` if that is None."""
@@ -227,10 +228,9 @@ class PolarView(View):
         Raises:
             ValueError: the spacing is "tan" and a lens has θ_max ≥ 90°.
         """
-        steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
+        steps_r, steps_phi = self._steps(lens)
         rings, last, offsets = self._rings(lens, steps_r), lens.theta_max, None
-        sector = torch.arange(self.sectors, dtype=steps_phi.dtype, device=steps_phi.device)[:, None]
-        azimuths = (sector + steps_phi).flatten() * (2 * math.pi / self.sectors)
+        azimuths = _azimuths(self.sectors, steps_phi)
         radii, center = rings.radii, lens.center_in(image_size)
         if self.theta_max is not None:
             radii = torch.where(rings.angles > last[:, None], torch.nan, radii)
@@ -242,9 +242,11 @@ class PolarView(View):
             offsets = _offsets(lens, theta, azimuths)
         return PolarGrid(radii, azimuths, center, rings.borders, last, lens.affine, offsets)
 
-    def pixel_grid(self, lens: Lens, image_size: tuple[int, int], split: int = 1) -> PixelGrid:
-        """The way back to images of (H, W) from a polar map with `split` rings per ring here."""
-        steps = _steps(split, "centers", lens.theta_max)
+    def pixel_grid(self, lens: Lens, image_size: Pair, map_size: Pair | None = None) -> PixelGrid:
+        """The way back to images of (H, W) from a polar map, or from one of another size (R', A'),
+        whose R' is a multiple of R."""
+        rings, sectors = map_size or (self.rings, self.sectors)
+        steps = _steps(rings // self.rings, "centers", lens.theta_max)
         radii, r_max = self._rings(lens, steps).radii, lens.r_max
         if self.theta_max is not None:
             end = lens.theta_max.clamp(max=self.theta_max)
@@ -261,7 +263,7 @@ class PolarView(View):
         # number of lenses, which may vary.
         if torch.compiler.is_compiling() or len(lens) != 1:
             return grid
-        of_map = radii.new_empty((1, radii.shape[1], self.sectors * split, 0))
+        of_map = radii.new_empty((1, *radii.shape[1:], sectors, 0))
         plan = polar_to_image_plan(
             of_map, radii, grid.center, image_size,
             affine=grid.affine, points=grid.points, r_max=grid.r_max,
@@ -279,14 +281,16 @@ class PolarView(View):
         rings, sectors = map_size or (self.rings, self.sectors)
         center = _steps(1, "centers", lens.theta_max)
         of_map = Rings(lens, rings, center, self.spacing, self.spacing, self.theta_max)
-        theta = of_map.angles[..., None]
-        sector = torch.arange(sectors, dtype=theta.dtype, device=theta.device)
-        azimuth = (sector + 0.5) * (2 * math.pi / sectors)
-        return vector_of(theta.expand(-1, -1, sectors), direction_of(azimuth))
+        return _rays(of_map.angles, _azimuths(sectors, center))
 
     def border_angles(self, lens: Lens) -> Tensor:
         """θ of the ring borders, (N, R+1) rad."""
         return self._rings(lens, lens.theta_max.new_zeros(1)).border_angles
+
+    def _steps(self, lens: Lens) -> tuple[Tensor, Tensor]:
+        """The positions of the samples in a cell, along radius and azimuth."""
+        steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
+        return steps_r, steps_phi
 
     def _rings(self, lens: Lens, steps: Tensor) -> Rings:
         inner = self.inner_spacing
@@ -315,6 +319,17 @@ def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
     """The positions of the samples of a cell, as fractions of the cell."""
     steps = torch.arange(count, dtype=like.dtype, device=like.device)
     return steps / (count - 1) if placement == "edges" else (steps + 0.5) / count
+
+
+def _azimuths(sectors: int, steps: Tensor) -> Tensor:
+    """The azimuths at these fractions of each sector, rad."""
+    sector = torch.arange(sectors, dtype=steps.dtype, device=steps.device)[:, None]
+    return (sector + steps).flatten() * (2 * math.pi / sectors)
+
+
+def _rays(theta: Tensor, azimuths: Tensor) -> Tensor:
+    """The unit vectors (x, y, z) of θ (N, R) and azimuths (A,), (N, R, A, 3)."""
+    return vector_of(theta[..., None].expand(-1, -1, len(azimuths)), direction_of(azimuths))
 
 
 def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:

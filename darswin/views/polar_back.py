@@ -29,6 +29,18 @@ def resized_around(maps: Tensor, size: Pair) -> Tensor:
     return resized(maps, (size[0], size[1] + 2 * whole))[..., whole : whole + size[1]]
 
 
+def from_edges(maps: Tensor, samples: Pair) -> Tensor:
+    """Polar images whose samples (S_r, S_φ) of each cell are from border to border, at the centres
+    of equal cells instead. The nearest sample of a centre has its number, as for integers."""
+    for dim, count in zip((2, 3), samples, strict=True):
+        number = torch.arange(count, dtype=maps.dtype, device=maps.device)
+        position = (number + 0.5) * ((count - 1) / count)
+        weights = (1 - (position[:, None] - number).abs()).clamp(min=0)
+        cells = maps.movedim(dim, -1).unflatten(-1, (-1, count))
+        maps = (cells @ weights.T).flatten(-2).movedim(-1, dim)
+    return maps
+
+
 def places_of(maps: Tensor) -> Tensor:
     """The places in polar maps (B, R, A, K), (1, R, A, 3): cos φ, sin φ, the number of the ring."""
     rings, sectors = maps.shape[1:3]

@@ -1,7 +1,7 @@
 """A view bound to one camera: the map between the camera's pictures and what the view shows."""
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, wraps
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from darswin.frames.plans import Plan, Sampler
 
 Points = TypeVar("Points", np.ndarray, Tensor)
+Value = TypeVar("Value")
 
 _ROUNDING = 1e-3  # px: a point that is this little beyond the edge of a picture is on it
 _NUDGE = 1e-3  # px, more than the rounding of points in float32
@@ -32,6 +33,18 @@ def tensor_like(like: Tensor, values: np.ndarray) -> Tensor:
     """The values as a tensor on the device of another one, in its floating type or else float32."""
     dtype = like.dtype if like.is_floating_point() else torch.float32
     return torch.as_tensor(values, dtype=dtype, device=like.device)
+
+
+def _kept(function: Callable[["Remap"], Value]) -> "cached_property[Value]":
+    """A property that is computed once: without gradients, but so that they can flow through it
+    later, also if it is first used in inference mode."""
+
+    @wraps(function)
+    def compute(remap: "Remap") -> Value:
+        with torch.inference_mode(False), torch.no_grad():
+            return function(remap)
+
+    return cached_property(compute)
 
 
 class Remap:
@@ -61,12 +74,12 @@ class Remap:
         if (view.uses_lens or lens is not None) and len(check_lens(lens, self.size)) != 1:
             raise ValueError(f"a view is bound to one lens, got {len(lens or ())}")
 
-    @cached_property
+    @_kept
     def lens(self) -> Lens | None:
         """The lens of the pictures, in float64 on the CPU, or None."""
         if self._given is None:
             return None
-        return self._given.detach().to("cpu", torch.float64)
+        return self._given.detach().to("cpu", torch.float64)._map(torch.clone)
 
     @property
     def some_lens(self) -> Lens:
@@ -75,14 +88,14 @@ class Remap:
             raise TypeError("rays need the lens of the pictures, but it is None")
         return self.lens
 
-    @cached_property
+    @_kept
     def tiles(self) -> Sequence["Remap"]:
         """A map for each picture that the view shows. Without tiles, that is the map itself."""
         if self.view.count == 1:
             return [self]
         return [Remap(tile, self._given, self.size) for tile in self.view.tiles]
 
-    @cached_property
+    @_kept
     def camera(self) -> Lens | None:
         """The lens of the view's picture, if it is that of a camera."""
         return self.view.camera(self._given, self.size)
@@ -188,7 +201,7 @@ class Remap:
             raise ValueError("points and boxes belong to one tile: use a map of remap.tiles")
         return self._bound
 
-    @cached_property
+    @_kept
     def _bound(self) -> Any:
         return self.view if self.lens is None else self.view.for_lens(self.lens, self.size)
 
@@ -277,7 +290,7 @@ class Remap:
             supersampling=self.points.shape[1] // self.view_size[1],
         )  # fmt: skip
 
-    @cached_property
+    @_kept
     def points(self) -> np.ndarray:
         """The points of the picture at which the view is read, (k·H', k·W', 2), k² for each pixel;
         tiles are below each other. `OUTSIDE` where the view shows nothing.
@@ -314,7 +327,7 @@ class Remap:
         missing = target.dtype.type(IGNORE if target.dtype == np.uint8 else 0)
         return np.where(inside, target.ravel()[index], missing)
 
-    @cached_property
+    @_kept
     def _target_points(self) -> np.ndarray:
         points = self._bound.points_of_target(self.lens, self.size)
         return points + _aside(self.view_size) @ self.view.turn.matrix
@@ -346,10 +359,9 @@ class Remap:
         shown = self._prepared.shown
         return np.ones(self.size, bool) if shown is None else shown[0].numpy()
 
-    @cached_property
+    @_kept
     def _prepared(self) -> Any:
-        with torch.no_grad():
-            return self._bound.prepare(self.lens, self.size)
+        return self._bound.prepare(self.lens, self.size)
 
 
 class Remaps(Sequence[Remap]):

@@ -3,12 +3,12 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, sample_at
-from darswin.lens.solve import direction_of, vector_of
 from darswin.ops.checks import as_int
 from darswin.utils.angles import degrees_hint
 from darswin.views.base import (
@@ -190,11 +190,10 @@ def _directions(
     """The middles of the tiles of a layout, level with `up`."""
     in_middle, angle, first, _ = _LAYOUTS[count]
     axis = unit_vector("direction", AXIS if direction is None else direction)
-    frame = torch.tensor(
-        frame_of(unit_vector("up", PICTURE_TOP if up is None else up), axis, False)
-    )
+    frame = np.array(frame_of(unit_vector("up", PICTURE_TOP if up is None else up), axis, False))
     around = count - in_middle
-    azimuth = math.radians(first) + torch.arange(around) * (2 * math.pi / around)
-    theta = torch.full((around,), math.radians(angle) * share)
-    ring = vector_of(theta, direction_of(azimuth)) @ frame.T
+    azimuth = math.radians(first) + np.arange(around) * (2 * math.pi / around)
+    theta = np.full(around, math.radians(angle) * share)
+    flat = np.sin(theta) * (np.cos(azimuth), np.sin(azimuth))
+    ring = np.stack((*flat, np.cos(theta)), 1) @ frame.T
     return [list(axis)] * in_middle + ring.tolist()

@@ -59,7 +59,7 @@ def test_prepare_keeps_a_plan_for_a_single_lens(dtype):
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
     """A function of (θ, φ) on the polar map becomes the same function of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
-    back = PolarView(32, 128, (1, 1), spacing=spacing).pixel_grid(lens, size, split=4)
+    back = PolarView(32, 128, (1, 1), spacing=spacing).pixel_grid(lens, size, (128, 512))
     theta = lens.unproject(back.radii)[0][:, None]
     azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
 
