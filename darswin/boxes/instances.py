@@ -163,7 +163,8 @@ class Instances:
         Args:
             points_map: from this picture to the new one.
             size: (H, W) of the new picture.
-            cut: (H, W) of this picture, to which upright boxes are clipped first.
+            cut: (H, W) of this picture, to which upright boxes are clipped first. Turned ones that
+                are wholly beyond it are not shown.
             masks: resamples a mask (H, W), bool, to the new picture. Without it, masks are left
                 out, and boxes do not follow them.
             rays: from points of this picture to rays.
@@ -176,9 +177,10 @@ class Instances:
         """
         old = self.boxes
         if cut is not None:
-            old = clip(old, cut) if old.shape[1] == 4 else old
-            has_area = (as_turned(old)[:, 2:4] > 0).all(1, keepdims=True)
-            old = np.where(has_area, old, np.nan)
+            clipped = clip(self.upright, cut)
+            sides = np.hstack((clipped[:, 2:] - clipped[:, :2], as_turned(old)[:, 2:4]))
+            clipped = clipped if old.shape[1] == 4 else old
+            old = np.where((sides > 0).all(1, keepdims=True), clipped, np.nan)
         by_mask = _known(None if masks is None else self.masks, len(old))
         by_outline = _known(self.outlines, len(old)) & ~by_mask
         alone = ~(by_mask | by_outline)

@@ -18,10 +18,10 @@ def load_timm_swin(source: Source, **options) -> Swin:
         source: a state dict, or the path of its file: safetensors, or what `torch.save` wrote, of
             which no code is executed.
         options: constructor arguments that cannot be read from the state dict: `image_size`, if it
-            is not 64.
+            is not 64. That of most weights of timm is 224.
 
     Raises:
-        ValueError: the keys or shapes are not those of timm's Swin.
+        ValueError: the keys or shapes are not those of timm's Swin, or image_size does not fit.
     """
 
     def convert(key: str, value: Tensor, model: Swin) -> tuple[str, Tensor]:
@@ -31,7 +31,16 @@ def load_timm_swin(source: Source, **options) -> Swin:
             value = _table(value, key, model)
         return key, value
 
-    return load_as("timm's Swin", source, lambda state: Swin(**(_swin(state) | options)), convert)
+    def make(state: Mapping[str, Tensor]) -> Swin:
+        try:
+            return Swin(**(_swin(state) | options))
+        except ValueError as error:
+            if "image_size" in options:
+                raise
+            text = "give image_size, which is 64 here, such as image_size=224: weights do not say it"
+            raise ValueError(f"{error}; {text}") from error
+
+    return load_as("timm's Swin", source, make, convert)
 
 
 def load_dat(source: Source, **options) -> DAT:

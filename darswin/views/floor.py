@@ -28,6 +28,7 @@ def on_floor(remap: Any, boxes: Any, height: float, up: Vector, radius: float) -
     foot = np.stack(((table[:, 0] + table[:, 2]) / 2, table[:, 3]), -1)
     right, down, ahead = (remap.rays(foot - 0.5) @ frame).T
     meets = (down > 1e-9) & (table[:, 3] < remap.view_size[0] - _CUT)
+    meets &= (table[:, :2] < table[:, 2:]).all(1)
     far = np.divide(height, down, out=np.full(len(table), np.nan), where=meets)
     place = far[:, None] * np.stack((right, ahead), -1)
     distance = np.hypot(*place.T)[:, None]

@@ -251,6 +251,8 @@ class PolarView(View):
         if self.theta_max is not None:
             end = lens.theta_max.clamp(max=self.theta_max)
             r_max = lens.project(end[:, None])[:, 0]
+        # Sides of an odd picture may be exactly at r_max: no rounding decides what is there.
+        r_max = r_max * (1 + 16 * torch.finfo(r_max.dtype).eps)  # as `Lens.unproject`
         if lens.is_radial:
             grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
         else:

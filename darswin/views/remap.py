@@ -163,8 +163,8 @@ class Remap:
             radius: of the things, which are upright cylinders, m. 0 finds their nearest points.
 
         Returns:
-            NaN where the lower side of a box is not below the horizon, or at the lower edge of the
-            view, where a thing may be cut.
+            NaN for a box without an area, and where its lower side is not below the horizon, or at
+            the lower edge of the view, where a thing may be cut.
 
         Raises:
             ValueError: a number is out of its range, or the view is not level with `up`.
@@ -211,15 +211,15 @@ class Remap:
         """What the view shows of a picture; 0 where it shows nothing.
 
         Args:
-            picture: an array (H, W) or (H, W, C), of uint8 or in floating point; or a tensor (B, C,
-                H, W), through which gradients flow.
+            picture: an array (H, W) or (H, W, C), of up to 16 bits or in floating point; or a
+                tensor (B, C, H, W), through which gradients flow. Ids are for `target`.
 
         Returns:
             (H', W') or (H', W', C), of the picture's dtype, n tiles as (n, H', W', …); of a tensor
             the result of `view.see`, (B·n, C, H', W').
 
         Raises:
-            TypeError: the picture is neither an array nor a tensor.
+            TypeError: the picture is neither an array nor a tensor, or has integers of more bits.
             ValueError: it has another size.
         """
         if isinstance(picture, Tensor):
@@ -229,6 +229,8 @@ class Remap:
         if not isinstance(picture, np.ndarray):
             kind = type(picture).__name__
             raise TypeError(f"the picture must be an array or a tensor, got {kind}")
+        if picture.dtype.kind in "iu" and picture.itemsize > 2:
+            raise TypeError(f"a picture of {picture.dtype} would be mixed: `target` moves ids")
         picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
         self._check_size("picture", picture.shape[:2])
         if not picture.size:  # no channels, which neither OpenCV nor torch takes

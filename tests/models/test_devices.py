@@ -42,7 +42,8 @@ MODELS = {
 
 
 def network(name, **options):
-    return create(name, **options).to("meta")
+    with torch.device("meta"):
+        return create(name, **options)
 
 
 def images(dtype=torch.float32, size=64):

@@ -127,6 +127,7 @@ def test_what_does_not_meet_the_floor_is_nan(view):
         [*middle, height / 2 - 5],  # above the horizon
         [*middle, height / 2],  # on it
         [*middle, height / 2 + 30],
+        [middle[0], middle[1], middle[0], height / 2 + 30],  # without an area
         [*middle, height],  # cut
         [*middle, height + 5],
         [np.nan] * 4,
@@ -134,7 +135,7 @@ def test_what_does_not_meet_the_floor_is_nan(view):
         [-np.inf, middle[1], np.inf, height / 2 + 30],
     ])  # fmt: skip
     found = tile.floor(box, 1.5, (0, -1, 0))
-    assert np.isnan(found).all(1).tolist() == [True] * 2 + [False] + [True] * 5
+    assert np.isnan(found).all(1).tolist() == [True] * 2 + [False] + [True] * 6
     assert tile.floor(np.zeros((0, 4)), 1.5, (0, -1, 0)).shape == (0, 2)
     same = tile.floor(torch.from_numpy(box).float(), 1.5, torch.tensor([0.0, -2, 0]))
     assert same.dtype == torch.float32

@@ -9,9 +9,9 @@ from helpers import CAMERAS, refused
 from torch.testing import assert_close
 
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
+from darswin.lens import Equidistant, Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
-from darswin.lens.solve import direction_of
+from darswin.lens.solve import direction_of, length_of
 from darswin.lens.spacing import SPACINGS
 from darswin.ops import polar_sample, polar_to_image
 from darswin.views import PolarView
@@ -192,6 +192,23 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
     inner = (exact > angles[0]) & (exact < end)
     assert inner.any() and (found[inner] - exact[inner]).abs().max() < 0.1 * end
     assert not found[exact.isnan()].any()
+
+
+@pytest.mark.parametrize("placement", ["centers", "edges"])
+@pytest.mark.parametrize("samples", [(2, 2), (2, 3), (4, 2)])
+def test_polar_images_come_back_to_their_pixels(samples, placement):
+    options = dict(layout="image", placement=placement, spacing="g", sample_spacing="theta")
+    view, lens = PolarView(8, 32, samples, **options), Equidistant.from_fov([3.0, 3.0], 40.0)
+    r = length_of(torch.stack(torch.meshgrid(*[torch.arange(80.0) - 39.5] * 2, indexing="ij"), -1))
+    for lenses in (lens[:1], lens):  # one lens has a plan
+        prepared = view.prepare(lenses, (80, 80))
+        back = view.back(view.see(r.expand(2, 1, 80, 80), prepared), prepared)
+        inner = (r > 16) & (r < 34)  # not around the pole, and not beyond the picture
+        assert (back - r)[..., inner].abs().max() < 0.05
+    x, y, z = view.ray_channels(lens, (80, 80)).unbind(1)
+    theta, azimuth = torch.atan2(length_of(torch.stack((x, y), -1)), z), torch.atan2(y, x)
+    assert_close(lens.project(theta), prepared.grid.radii[..., None].expand_as(theta))
+    assert_close(direction_of(azimuth), direction_of(prepared.grid.azimuths).expand(*x.shape, 2))
 
 
 # -- samples and their embedding ----------------------------------------------------------------

@@ -92,6 +92,8 @@ def test_pictures_and_maps_that_do_not_fit_are_refused():
         (lambda: remap(torch.zeros(1, 3, 9, 9)), ValueError, r"picture must be .*, got \(9, 9\)"),
         (lambda: remap(torch.zeros(3, *SIZE)), ValueError, r"\(B, C, H, W\), .* pass images\[N"),
         (lambda: remap([[1, 2]]), TypeError, "the picture must be an array or a tensor, got list"),
+        (lambda: remap(np.zeros(SIZE, "i4")), TypeError, "int32 would be mixed: `target` moves"),
+        (lambda: remap(np.zeros(SIZE, ">u8")), TypeError, "of >u8 would be mixed"),
         (lambda: remap.target(np.zeros((*SIZE, 3))), ValueError, r"target must be .*, got \(90"),
         (lambda: remap.back(np.zeros((8, 8))), ValueError, r"have shape \(K, h, w\), got"),
         (lambda: remap.back(torch.zeros(1, 8, 8)), ValueError, r"have shape \(B, K, h, w\), got"),
@@ -106,6 +108,17 @@ def test_pictures_and_maps_that_do_not_fit_are_refused():
         (lambda: CameraView("front.json"), TypeError, "lens must be a .*Lens, got str"),
     ):
         refused(message, call, error=kind)
+
+
+@pytest.mark.parametrize("name", ["mercator", "crop", "camera"])
+def test_what_is_kept_in_inference_mode_carries_gradients(name):
+    points, grads = torch.tensor([[50.0, 41.0]], requires_grad=True), []
+    for mode in (False, True):
+        with torch.inference_mode(mode):
+            remap = VIEWS[name].at(CUT[:1] if mode else CUT, SIZE)
+            remap.to_view(points.detach())
+        grads += torch.autograd.grad(remap.to_view(points).sum(), points)
+    assert torch.equal(*grads) and grads[0].isfinite().all()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
