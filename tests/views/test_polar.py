@@ -205,10 +205,9 @@ def test_polar_images_come_back_to_their_pixels(samples, placement):
         back = view.back(view.see(r.expand(2, 1, 80, 80), prepared), prepared)
         inner = (r > 16) & (r < 34)  # not around the pole, and not beyond the picture
         assert (back - r)[..., inner].abs().max() < 0.05
-    x, y, z = view.ray_channels(lens, (80, 80)).unbind(1)
-    theta, azimuth = torch.atan2(length_of(torch.stack((x, y), -1)), z), torch.atan2(y, x)
-    assert_close(lens.project(theta), prepared.grid.radii[..., None].expand_as(theta))
-    assert_close(direction_of(azimuth), direction_of(prepared.grid.azimuths).expand(*x.shape, 2))
+    places = prepared.grid.radii[..., None, None] * direction_of(prepared.grid.azimuths) + 39.5
+    rays = view.ray_channels(lens, (80, 80)).movedim(1, -1)
+    assert_close(rays, lens.unproject_points(places, (80, 80)), rtol=0, atol=1e-5)
 
 
 # -- samples and their embedding ----------------------------------------------------------------
