@@ -51,7 +51,7 @@ class Peers:
     """Attention in windows as users write it: roll, partition, attend, reverse, roll back.
 
     As in Swin, the bias of all pairs is indexed from the table. With `slices` it is made of slices,
-    because torch 2.13's inductor miscompiles the gradient of that index (pytorch#191837).
+    because a report says that inductor miscompiles the gradient of the index (pytorch#191837).
     """
 
     def __init__(self, case: str, batch: int, slices: bool):
