@@ -62,27 +62,44 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
             if not ray[k].any():
                 ray[k] = of_box.sum(0)
     ray[np.isnan(rays).all((1, 2))] = np.nan
-    for _ in range(8):  # each turn halves the digits that the middle lacks
-        azimuth = np.arctan2(ray[:, 0], ray[:, 2])
-        elevation = np.arctan2(-ray[:, 1], np.hypot(ray[:, 0], ray[:, 2]))
-        frame = _looking(azimuth, elevation)
-        x, y, z = np.moveaxis(rays @ frame.mT, -1, 0)
-        aside = np.hypot(x, y)
-        # θ, along the direction from the middle: good for angles beyond 90°.
-        scale = np.divide(np.arctan2(aside, z), aside, out=np.ones(x.shape), where=aside > 0)
-        across, down = x * scale, y * scale
-        low = np.stack((np.fmin.reduce(across, axis=1), np.fmin.reduce(down, axis=1)))
-        high = np.stack((np.fmax.reduce(across, axis=1), np.fmax.reduce(down, axis=1)))
+    best, least = ray, np.full(len(ray), np.inf)
+    for turn in range(33):
+        azimuth, elevation, frame, low, high = _ends(rays, ray)
         u, v = (low + high) / 2
         theta = np.hypot(u, v)
-        aside = np.sinc(theta / np.pi)  # sin θ / θ
-        ray = (np.stack((u * aside, v * aside, np.cos(theta)), -1)[:, None] @ frame)[:, 0]
+        best = np.where((theta < least)[:, None], ray, best)
+        least = np.fmin(theta, least)
+        if turn >= 8 and (theta < 1e-7).all():  # each turn halves the digits that the middle lacks
+            break
+        # Near the zenith, what is level changes fast: half of the way is better there.
+        step = (0.5 if turn >= 8 else 1.0) * theta
+        aside = np.divide(np.sin(step), theta, out=np.ones(len(ray)), where=theta > 0)
+        ray = (np.stack((u * aside, v * aside, np.cos(step)), -1)[:, None] @ frame)[:, 0]
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    azimuth, elevation, frame, low, high = _ends(rays, best)
+    ray = frame[:, 2]
     width, height = high - low
     solid = 4 * np.arcsin(np.sin(width / 2) * np.sin(height / 2))
     solid[(width > np.pi) | (height > np.pi)] = np.nan
     values = (azimuth, elevation, width, height, ray, solid)
     return SphericalBoxes(*(like(boxes, value) for value in values))
+
+
+def _ends(
+    rays: np.ndarray, ray: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cameras that look along a ray (K, 3): their azimuth, elevation and axes, and the least and
+    the greatest angle to the right and down, (2, K) rad, of rays (K, P, 3)."""
+    azimuth = np.arctan2(ray[:, 0], ray[:, 2])
+    elevation = np.arctan2(-ray[:, 1], np.hypot(ray[:, 0], ray[:, 2]))
+    frame = _looking(azimuth, elevation)
+    x, y, z = np.moveaxis(rays @ frame.mT, -1, 0)
+    aside = np.hypot(x, y)
+    # θ, along the direction from the middle: good for angles beyond 90°.
+    scale = np.divide(np.arctan2(aside, z), aside, out=np.ones(x.shape), where=aside > 0)
+    angles = np.stack((x * scale, y * scale))
+    low, high = np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)
+    return azimuth, elevation, frame, low, high
 
 
 def _looking(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

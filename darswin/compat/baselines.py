@@ -37,7 +37,7 @@ def load_timm_swin(source: Source, **options) -> Swin:
         except ValueError as error:
             if "image_size" in options:
                 raise
-            text = "give image_size, which is 64 here, such as image_size=224: weights do not say it"
+            text = "give image_size, which is 64 here, as image_size=224: weights do not say it"
             raise ValueError(f"{error}; {text}") from error
 
     return load_as("timm's Swin", source, make, convert)

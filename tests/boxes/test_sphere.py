@@ -53,6 +53,21 @@ def fisheye_rays(points):
     return np.where(theta <= math.radians(120.1), rays, np.nan)
 
 
+@pytest.mark.parametrize("middle", [(310, 148), (290, 142), (300, 455), (340, 139)])
+def test_thin_boxes_near_the_zenith_are_seen_around_their_middles(middle):
+    half = np.array([125, 0.25])
+    found = boxes.spherical([[*(middle - half), *(middle + half)]], fisheye_rays)
+    turn = np.linspace(0, 2 * np.pi, 7200)
+    rays = fisheye_rays(middle + half * np.stack((np.cos(turn), np.sin(turn)), -1) - 0.5)
+    angles = [found.azimuth[0], found.elevation[0]]
+    seen = Rotation.from_euler("YX", angles).inv().apply(rays)
+    theta = np.arctan2(np.linalg.norm(seen[:, :2], axis=1), seen[:, 2])
+    angles = seen[:, :2] * (theta / np.linalg.norm(seen[:, :2], axis=1))[:, None]
+    sides = np.stack((found.width, found.height), -1)[0] / 2
+    np.testing.assert_allclose(angles.max(0), sides, atol=1e-3)
+    np.testing.assert_allclose(angles.min(0), -sides, atol=1e-3)
+
+
 def test_spherical_boxes_beyond_180_degrees_and_at_the_rim():
     """What the camera that looks at the middle sees, by every point of the ellipse."""
     wide, high = math.radians(240), math.radians(71)
