@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import slow_but
+from helpers import refused, slow_but
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -118,16 +118,18 @@ def nanodet():
     return cells
 
 
-def protos():
+def protos(count=32):
     """A mask for each thing, of its box and half a pixel more, and others."""
     y, x = np.mgrid[: HEIGHT // 4, : WIDTH // 4] * 4 + 2
-    masks = np.full((32, HEIGHT // 4, WIDTH // 4), -8.0)
+    masks = np.full((count, HEIGHT // 4, WIDTH // 4), -8.0)
     for k, (x0, y0, x1, y1) in enumerate(BOXES):
         masks[k][(x > x0 - 9) & (x < x1 - 5) & (y > y0) & (y < y1 + 9)] = 8
     return masks
 
 
-WEIGHTS = np.eye(K, 32)
+WEIGHTS = np.eye(K, 64)
+UPPER = np.zeros((K, 28, 28))  # the upper half of each box
+UPPER[:, :14] = 1
 IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
 
 
@@ -154,15 +156,30 @@ def row(values, *more):
 FORMS = {
     "own": (dict(boxes=full(BOXES), scores=full(SCORES), labels=full(LABELS).astype(int)), {}),
     "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
+    "own, by other names, in parts": (
+        dict(bboxes=full(IN_PARTS), class_idx=full(LABELS).astype(int), conf=full(SCORES)), {},
+    ),
+    "own, of all cells": (
+        dict(boxes=full(BOXES, 735), scores=full(SCORES, 735),
+             class_ids=full(LABELS, 735).astype(int)), {},
+    ),
+    "own, counted, with keypoints": (
+        dict(num_dets=np.array([K]), boxes=full(BOXES), scores=np.r_[SCORES, np.full(288, 0.99)],
+             labels=full(LABELS).astype(int), keypoints=full(POINTS)), {},
+    ),
     "table": (dict(out=full(ROWS)), {}),
+    "table in parts": (
+        dict(out=full(beside(IN_PARTS, SCORES, LABELS))), dict(form="table"),
+    ),
+    "table of all cells": (dict(out=full(ROWS, 735)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
     "detect without task": (
         dict(output0=yolo(beside(CENTRED, one_hot(80)))),
         dict(metadata={"names": [*NAMES.values()]}),
     ),
-    "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(told="detect")),
+    "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(form="detect")),
     "segment": (
-        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos()),
+        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos(64)),
         of("segment"),
     ),
     "pose": (dict(output0=yolo(beside(CENTRED, SCORES, POINTS))), dict(metadata=POSE)),
@@ -173,7 +190,7 @@ FORMS = {
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
     "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=full(beside(ROWS, WEIGHTS)), output1=protos()),
+        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=protos(16)),
         of("segment"),
     ),
     "pose, end to end": (
@@ -192,6 +209,14 @@ FORMS = {
     "RT-DETR of Ultralytics, older": (
         dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
     ),
+    "RT-DETR of Ultralytics, 2 classes": (
+        dict(output0=beside(CENTRED_PARTS, one_hot(2, labels=LABELS % 2))),
+        dict(metadata=ULTRA | {"task": "detect", "names": ["a", "b"]}),
+    ),
+    "RT-DETR of Ultralytics, one class": (
+        dict(output0=beside(CENTRED_PARTS, SCORES)),
+        dict(metadata=ULTRA | {"task": "detect", "names": ["a"]}),
+    ),
     "YOLOv5": (
         dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
                           cell_row(81, first=(0.01,)), each=3),
@@ -206,7 +231,8 @@ FORMS = {
                           cell_row(2, first=(0.01,)), each=3)), {},
     ),
     "YOLOv5 segment": (
-        dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98), WEIGHTS),
+        dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98),
+                                  WEIGHTS[:, :32]),
                            cell_row(113, first=(0.01,)), each=3), output1=protos()), {},
     ),
     "YOLOv6": (
@@ -222,13 +248,18 @@ FORMS = {
     "RF-DETR segment": (
         dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
     ),
+    "RF-DETR with a column for nothing, and keypoints": (
+        dict(dets=CENTRED_PARTS, labels=np.hstack((logit(one_hot(80)), np.full((K, 1), 9.0))),
+             keypoints=np.concatenate((POINTS[..., :2] / SIZE[::-1], POINTS[..., 2:]), 2)),
+        dict(metadata={"names": NAMES}),
+    ),
     "RT-DETR": (
         dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes"),
     ),
     "DETR": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS), dict(model_type="detr", masked=True)),
     "DETR, told": (
         dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))),
-        dict(scores="softmax"),
+        dict(form="softmax"),
     ),
     "D-FINE of transformers": (
         dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine"),
@@ -237,10 +268,19 @@ FORMS = {
         {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
          "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0)}, {},
     ),
+    "TensorFlow with masks of boxes, and keypoints": (
+        {"detection_boxes": IN_PARTS[:, YX], "detection_scores": SCORES,
+         "detection_classes": LABELS * 1.0, "num_detections": np.array([K * 1.0]),
+         "detection_masks": UPPER, "detection_keypoint_scores": POINTS[..., 2],
+         "detection_keypoints": POINTS[..., 1::-1] / SIZE, "raw_detection_boxes": IN_PARTS}, {},
+    ),
     "EfficientDet": (dict(detections=row(BOXES[:, YX], SCORES, LABELS)), {}),
     "MMDeploy": (dict(dets=beside(BOXES, SCORES), labels=LABELS), {}),
-    "MMDeploy segment": (
-        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
+    "MMDeploy with masks of boxes": (
+        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=UPPER), {},
+    ),
+    "MMPose with keypoints, one class": (
+        dict(dets=beside(BOXES, SCORES), keypoints=POINTS), {},
     ),
     "EfficientNMS": (
         dict(num_dets=np.array([K]), det_boxes=full(BOXES, 100),
@@ -272,10 +312,13 @@ FLAT = {
 }  # fmt: skip
 # What is only known by names, metadata or a word, so that it is asked for without them.
 ASKED = {
-    "own, one masked", "detect", "detect without task", "detect of 51", "pose", "pose of 2", "obb",
-    "pose, end to end", "obb, end to end", "RT-DETR of Ultralytics",
+    "own, one masked", "table in parts", "detect", "detect without task", "detect of 51", "pose",
+    "pose of 2", "obb", "pose, end to end", "obb, end to end", "RT-DETR of Ultralytics",
+    "RT-DETR of Ultralytics, 2 classes", "RT-DETR of Ultralytics, one class",
     "RT-DETR of Ultralytics, the best", "RT-DETR of Ultralytics, older", "RF-DETR",
-    "RF-DETR segment", "DETR", "DETR, told", "D-FINE of transformers", "TensorFlow", "EfficientDet",
+    "RF-DETR with a column for nothing, and keypoints", "RF-DETR segment", "DETR", "DETR, told",
+    "D-FINE of transformers", "TensorFlow", "TensorFlow with masks of boxes, and keypoints",
+    "EfficientDet",
 }  # fmt: skip
 ALL = FORMS | FLAT
 
@@ -284,12 +327,12 @@ def written(folder, form, dtype=np.float32, batch=1, renamed=False):
     """The network of a form, and the words that it needs."""
     outputs, how = ALL[form]
     how = dict(how)
-    words = {"task": how.pop("told", None), "scores": how.pop("scores", None)}
+    words = {"form": how.pop("form", None)}
     if "model_type" in how:
         config = dict(model_type=how.pop("model_type"), id2label=NAMES)
         (folder / "config.json").write_text(json.dumps(config))
     if renamed:
-        names = dict(zip(outputs, "abcdef", strict=False))
+        names = dict(zip(outputs, "abcdefgh", strict=False))
         outputs = {names[name]: value for name, value in outputs.items()}
         how["sized"] = names.get(how.get("sized"))
         how.pop("metadata", None)
@@ -306,7 +349,8 @@ def written(folder, form, dtype=np.float32, batch=1, renamed=False):
 def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
     order = np.argsort(-found.scores)
     turned = "obb" in form
-    labels = 0 * LABELS if "pose" in form or "one class" in form else LABELS
+    labels = LABELS % 2 if "2 classes" in form else LABELS
+    labels = 0 * LABELS if "pose" in form or "one class" in form else labels
     expected = np.concatenate((CENTRED, ANGLES), 1) if turned else BOXES
     np.testing.assert_allclose(found.boxes[order], expected, atol=px)
     np.testing.assert_allclose(found.scores[order], SCORES, atol=in_scores)
@@ -316,9 +360,13 @@ def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
         numbers = found.keypoints.shape[2]
         assert numbers == (2 if form == "pose of 2" else 3)
         np.testing.assert_allclose(found.keypoints[order], POINTS[..., :numbers], atol=px)
-    shows = ("segment" in form or "masks" in form) and "MMDeploy" not in form
-    assert (found.masks is None) != shows
-    if shows:
+    assert (found.masks is None) != ("segment" in form or "masks" in form)
+    if "masks of boxes" in form:
+        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        for mask, (x0, y0, x1, y1) in zip(found.masks[order], BOXES, strict=True):
+            upper = (x > x0) & (x < x1) & (y > y0) & (y < (y0 + y1) / 2)
+            assert ((mask > 0.5) != upper).sum() < 0.08 * upper.sum()
+    elif found.masks is not None:
         for mask, box, known in zip(found.masks[order], found.boxes[order], protos(), strict=False):
             scale = HEIGHT // mask.shape[0]
             y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] * scale + scale / 2
@@ -358,7 +406,7 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         network = OnnxNetwork(path)
     except ValueError as error:
         assert form in ASKED, error
-        said = ("say which by `", "known are")
+        said = ("say which by `form`", "known are")
         assert "has the outputs" in str(error) and any(words in str(error) for words in said)
     else:
         assert form not in ASKED
@@ -370,9 +418,9 @@ def test_no_form_is_taken_for_another(tmp_path, form):
 def test_scores_of_1_are_no_classes(tmp_path, last):
     """In tables with the number of the picture, whose class may stand before the score or after."""
     row = [0, 10, 20, 30, 40, 18.0 - last, last]
-    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row], np.float32)})
+    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row] * 2, np.float32)})
     (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
-    assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
+    assert (found.labels.tolist(), found.scores.tolist()) == ([17] * 2, [1] * 2)
 
 
 @pytest.mark.filterwarnings("error")
@@ -389,20 +437,16 @@ def test_logits_may_be_very_low(tmp_path):
 
 
 def test_words_that_do_not_fit_are_told(tmp_path):
-    for form, words, said in (
-        ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
-        (
-            "detect",
-            {"task": "boxes"},
-            "`task` must be one of detect, pose, obb, segment, got boxes",
-        ),
-        ("own", {"task": "pose"}, "`task` is pose, but the form '.*' has no keypoints"),
-        ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
-        ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
+    for form, word, said in (
+        ("detect", "pose", "`form` must be one that its outputs may have, detect, got pose"),
+        ("table", "pose", "may have, detect, rtdetr or table, got pose"),
+        ("own", "sigmoid", "may have, boxes, got sigmoid"),
+        ("own", "tanh", "`form` must be one of detect, pose, .*, numbers, got tanh"),
+        ("own", "numbers", "known are the forms"),
+        ("table in parts", None, "may be rtdetr or table: say which by `form`"),
     ):
         path, _ = written(tmp_path, form)
-        with pytest.raises(ValueError, match=said):
-            OnnxNetwork(path, **words)
+        refused(said, OnnxNetwork, path, form=word)
 
 
 def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):

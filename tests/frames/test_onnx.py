@@ -126,9 +126,9 @@ def test_scores_of_overlapping_boxes_must_be_probabilities(tmp_path):
             changed[..., columns] = low + (high - low) * table[..., columns]
             path = write_detector(tmp_path / "n.onnx", (96, 96), {"out": changed})
             if is_known:
-                assert OnnxNetwork(path).form == "YOLOX"
+                assert OnnxNetwork(path).form == "yolox"
                 continue
-            said = "that of YOLOX, but its scores must be from 0 to 1, got .*sigmoid"
+            said = "that of yolox, but its scores must be from 0 to 1, got .*sigmoid"
             refused(said, OnnxNetwork, path)
 
 
@@ -174,8 +174,25 @@ def test_other_inputs_and_files_are_told(tmp_path):
     refused(f"{said}.*; it must have one, pictures", OnnxNetwork, path)
     path = write_graph(tmp_path / "double.onnx", dtype="double", size=SIZE)
     refused(r"double.onnx has the inputs images .* of tensor\(double", OnnxNetwork, path)
-    (tmp_path / "none.onnx").write_text("no network")
-    refused(r"onnxruntime cannot read .*none\.onnx", OnnxNetwork, tmp_path / "none.onnx")
+    good, other = write_graph(tmp_path / "good.onnx").read_bytes(), tmp_path / "other.onnx"
+    for content, said in (
+        (b"\n<!DOCTYPE html><html>", r"other.onnx is a page of HTML"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid",
+            "a pointer of Git LFS .* `git lfs pull`",
+        ),
+        (b"PK\x03\x04\0\0", "such as a checkpoint of torch: export the network to ONNX"),
+        (b"\x1c\0\0\0TFL3", "TensorFlow Lite"),
+        (b"Entry not found", "is text, not a network"),
+        (good[: len(good) // 2], "onnxruntime cannot read .*other.onnx: .*parsing failed"),
+        (
+            good.replace(b"\x08\x08", b"\x08\x63", 1),
+            "IR version 99, and onnxruntime reads [0-9]+ at",
+        ),
+        (good[:-1] + b"\x63", "operator set 99 of ai.onnx, and onnxruntime knows [0-9]+ at most"),
+    ):
+        other.write_bytes(content)
+        refused(said, OnnxNetwork, other)
     with pytest.raises(FileNotFoundError, match=r"there is no file .*gone\.onnx"):
         OnnxNetwork(tmp_path / "gone.onnx")
     onnx = pytest.importorskip("onnx")
