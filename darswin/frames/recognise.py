@@ -227,7 +227,7 @@ def _beside(outputs: Outputs, of: Sequence[int], boxes: str) -> Where:
             parts["point_scores"] = name
         elif len(rest) == 2 and rest[1] in (2, 3):
             parts["points"] = name
-        elif len(rest) in (2, 3) and rest[-3:-2] in ((), (1,)) and min(rest[-2:]) > 3:
+        elif len(rest) in (2, 3) and rest[-3:-2] in ((), (1,)) and not _says(name, *_POINT):
             parts["masks"] = name
     if "points" not in parts or outputs[parts["points"]].shape[-1] != 2:
         parts.pop("point_scores", None)
@@ -258,7 +258,7 @@ def _tables(network: Network) -> Candidates:
     strides, each = grids(size).get(count_of, ((), 0))
     if count_of > 4 and grids(size).get(width, ((), 0))[1] == 1:
         yield from _ultralytics(network, name, count_of, True, masks, more)
-    elif not each or (width == 6 and _are_whole(values[..., 5])):  # a column of classes
+    elif not each or (width == 6 and _has_class(values)):
         yield from _final(network, name, masks, more)
     elif width > 5 + masks:
         where = _columns(name, boxes=4, objectness=1, scores=width - 5 - masks, weights=masks)
@@ -275,6 +275,12 @@ def _tables(network: Network) -> Candidates:
             yield SURE, Form("yolox", where, "middle", pixels=_BYTES)
         else:
             yield SURE, Form("yolox", where, "yolox", False, pixels=_BYTES)
+
+
+def _has_class(values: np.ndarray) -> bool:
+    """Whether the last of 6 columns is a class, not a probability, which 16 bits make 1."""
+    label = values[..., 5]
+    return _are_whole(label) and (not label.any() or _are_corners(values))
 
 
 def _is_shared(shape: Sequence[int], size: Size) -> bool:

@@ -227,8 +227,8 @@ FORMS = {
                           cell_row(81, first=(0.01,)), (8, 16, 32, 64), 3)), {},
     ),
     "YOLOv5 of one class": (
-        dict(output=dense(beside(CENTRED, np.full(K, 0.98), SCORES / 0.98),
-                          cell_row(2, first=(0.01,)), each=3)), {},
+        dict(output=dense(beside(CENTRED, SCORES, np.ones(K)),  # as 16 bits round it
+                          cell_row(2, first=(0.01, 1)), each=3)), {},
     ),
     "YOLOv5 segment": (
         dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98),
