@@ -34,8 +34,8 @@ class Form:
 
     Attributes:
         name: a word of `darswin.frames.recognise.FORMS`.
-        where: the output and the columns of each part of a detection. The columns "either" are the
-            score and the class, in the order that the first rows tell.
+        where: the output and the columns of each part of a detection; "either" are those of score
+            and class, whose order the first rows tell.
         code: how boxes are written: corners x0, y0, x1, y1; rows y0, x0, y1, x1; middle and size;
             or relative to the cells of grids, as yolox or nanodet do.
         in_parts, points_in_parts: boxes and keypoints are parts of the picture, not pixels; None
@@ -122,28 +122,24 @@ def _pictures(form: Form, outputs: Outputs, count: int) -> list[dict[str, np.nda
 
 def orders_of(pairs: np.ndarray) -> list[int]:
     """The columns, 0 or 1, of pairs (N, 2) that can be scores while the others are classes."""
-    columns = pairs.T
+    both = (pairs.T, pairs.T[::-1])
     return [
-        k for k in (0, 1)
-        if ((columns[k] > 0) & (columns[k] <= 1)).all() and not (columns[1 - k] % 1).any()
+        k for k, (score, label) in enumerate(both)
+        if ((score > 0) & (score <= 1)).all() and not (label % 1).any()
     ]  # fmt: skip
 
 
 def _with_order(form: Form, outputs: Outputs) -> Form:
-    """The form with its score and its class where the rows have them, which may be equal."""
+    """The form with its score and its class where the rows have them, if they are not equal."""
     name, columns = form.where["either"]
     pairs = outputs[name][..., columns]
     if not (orders := orders_of(pairs)):
-        raise ValueError(
-            "its last columns must be a score above 0 and up to 1, and a class, got "
-            + ", ".join(f"{value:g}" for value in pairs[0])
-        )
-    first, label = columns.start + orders[0], columns.start + 1 - orders[0]
-    parts = {"scores": first, "labels": label}
-    where = form.where | {key: (name, slice(at, at + 1)) for key, at in parts.items()}
-    if len(orders) == 1:
-        del where["either"]
-    return replace(form, where=where)
+        text = ", ".join(f"{value:g}" for value in pairs[0])
+        raise ValueError(f"its last columns must be a score up to 1 and a class, got {text}")
+    score, label = columns.start + orders[0], columns.start + 1 - orders[0]
+    where = dict(scores=(name, slice(score, score + 1)), labels=(name, slice(label, label + 1)))
+    where |= {} if len(orders) == 1 else {"either": (name, columns)}
+    return replace(form, where={k: v for k, v in form.where.items() if k != "either"} | where)
 
 
 def _kept(
@@ -155,6 +151,13 @@ def _kept(
     if form.scores == "softmax":  # the last class is nothing
         scores = np.exp(scores - scores.max(-1, keepdims=True))
         scores = (scores / scores.sum(-1, keepdims=True))[:, :-1]
+    for values in (scores, parts.get("objectness", scores)) if form.overlaps else ():
+        low, high = values.min(initial=0), values.max(initial=0)
+        if low < -0.01 or high > 1.01:
+            raise ValueError(
+                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
+                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
+            )
     labels = parts["labels"].reshape(rows) if "labels" in parts else scores.argmax(-1)
     score = scores.max(-1)
     if form.scores == "sigmoid":

@@ -80,14 +80,11 @@ def form_of(network: Network, word: str | None = None) -> Form | None:
         text = f"their form may be {_or(words)}: say which by `form`, or keep what tells it, the "
         text += "metadata that `yolo export` writes, or transformers' config.json beside the file"
         raise naming(ValueError(text), "form")
-    if not forms:
-        return None
-    name, _ = forms[0].where["boxes"]
-    count = network.outputs[name].shape[-1 if forms[0].things_last else -2]
-    overlaps = "count" not in forms[0].where and (count in grids(network.size) or count > _MOST)
-    if overlaps:
-        _check_scores(forms[0], network.outputs)
-    return replace(forms[0], overlaps=overlaps)
+    for form in forms[:1]:
+        count = network.outputs[form.where["boxes"][0]].shape[-1 if form.things_last else -2]
+        is_raw = not form.scores and (count in grids(network.size) or count > _MOST)
+        return replace(form, overlaps=is_raw and "count" not in form.where)
+    return None
 
 
 def unused(form: Form, outputs: Collection[str]) -> list[str]:
@@ -97,18 +94,6 @@ def unused(form: Form, outputs: Collection[str]) -> list[str]:
 
 def _or(words: Sequence[str]) -> str:
     return " or ".join((", ".join(words[:-1]), words[-1]) if len(words) > 1 else words) or "numbers"
-
-
-def _check_scores(form: Form, outputs: Outputs) -> None:
-    """ValueError for scores that are no probabilities, of a form whose scores are some."""
-    for name, columns in (form.where[key] for key in ("scores", "objectness") if key in form.where):
-        values = outputs[name].swapaxes(1, 2) if form.things_last else outputs[name]
-        low, high = values[..., columns].min(), values[..., columns].max()
-        if low < -0.01 or high > 1.01:
-            raise ValueError(
-                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
-                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
-            )
 
 
 def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
