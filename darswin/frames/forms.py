@@ -107,7 +107,7 @@ def _pictures(form: Form, outputs: Outputs, count: int) -> list[dict[str, np.nda
         values = outputs[name]
         if form.things_last and values.ndim == 3:
             values = values.swapaxes(1, 2)
-        parts[key] = values[..., columns] if values.ndim else values
+        parts[key] = values.reshape(-1) if key == "count" else values[..., columns]
     if "image" in parts:
         rows = {key: values.reshape(-1, values.shape[-1]) for key, values in parts.items()}
         number = rows["image"][:, 0]
@@ -166,7 +166,7 @@ def _kept(
         score = score * parts["objectness"][:, 0]
     keep = ~(score < threshold)
     if "count" in parts:
-        used = int(parts["count"].reshape(-1)[0])
+        used = int(parts["count"].max())
         if not 0 <= used <= rows:
             raise ValueError(f"it says that {used} of {rows} boxes are things")
         keep[used:] = False

@@ -33,14 +33,13 @@ _KNOWN = (
 
 
 # What is given in place of an ONNX file, by its first bytes.
-_HEAD = 1024
 _OTHERS = {
     "a pointer of Git LFS in place of the network: run `git lfs pull`": rb"version https://git-lfs",
-    "a page of HTML, not a network: perhaps its download failed": rb"\s*<(!doctype html|html)",
-    "a zip archive or a pickle, such as a checkpoint of torch: export the network to ONNX":
-        rb"PK\x03\x04|\x80[\x02-\x05]",
-    "a file of TensorFlow Lite: convert the network to ONNX": rb".{4}TFL3",
-    "text, not a network in ONNX": rb"[\t\n\r -~]{9,}\Z",
+    "a page of HTML or XML, not a network: perhaps its download failed":
+        rb"(\xef\xbb\xbf)?\s*<(!doctype|!--|\?xml|html|head)",
+    "a file of another kind, such as a checkpoint of torch or Keras: export the network to ONNX":
+        rb"PK\x03\x04|\x80[\x02-\x05]|\x1f\x8b|\x89HDF|ftrt|.{4}TFL3|.{7}\0\{",
+    "text, not a network in ONNX": rb"[^\x00-\x08\x0e-\x1f]{9,}\Z",
 }  # fmt: skip
 
 
@@ -207,12 +206,7 @@ class OnnxNetwork:
         try:
             values = self._session.run(None, puts)
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
-            text = f"onnxruntime cannot run {self.path}: {_line(error)}"
-            if self.has_size:
-                raise ValueError(text) from error
-            text += f"; it takes pictures of any `size`, but perhaps not of {self.size[0]},"
-            text += f"{self.size[1]}: mostly both must be multiples of 32"
-            raise naming(ValueError(text), "size") from error
+            raise self._error(f"onnxruntime cannot run {self.path}: {_line(error)}") from error
         outputs = {
             put.name: np.asarray(value)[None] if self._is_single else np.asarray(value)
             for put, value in zip(self._session.get_outputs(), values, strict=True)
@@ -223,6 +217,14 @@ class OnnxNetwork:
             shapes = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
             text = f"{self.path} has the outputs {', '.join(shapes)}; {error}"
             raise ValueError(text) from error
+
+    def _error(self, text: str) -> ValueError:
+        """An error that the size may cause, if the graph leaves it free."""
+        height, width = self.size
+        hint = (
+            f". Perhaps {height},{width} is no `size` that it takes: mostly it has multiples of 32"
+        )
+        return naming(ValueError(text + hint * (not self.has_size)), "size")
 
     def _sizes(self, count: int) -> dict[str, np.ndarray]:
         """The inputs beside the pictures, which tell their size."""
@@ -246,7 +248,7 @@ class OnnxNetwork:
             self._form = form_of(network, self._asked)
         if self._form is None:
             if not (others := self._others(outputs, count)):
-                raise ValueError(_KNOWN)
+                raise self._error(_KNOWN)
             return others
         self._form, detections = decode(self._form, outputs, count, self.size, self.threshold)
         for instances in detections:
@@ -315,10 +317,10 @@ def _session(path: str) -> Any:
         return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         with open(path, "rb") as file:
-            head = file.read(_HEAD)
-        said = next((what for what, mark in _OTHERS.items() if re.match(mark, head, re.I)), None)
-        if said is not None:
-            raise ValueError(f"{path} is {said}") from error
+            head = file.read(1024)
+        for kind, mark in _OTHERS.items():
+            if re.match(mark, head, re.IGNORECASE | re.DOTALL):
+                raise ValueError(f"{path} is {kind}") from error
         raise ValueError(f"onnxruntime cannot read {path}: {_line(error)}") from error
 
 

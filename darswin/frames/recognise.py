@@ -28,7 +28,7 @@ _MODELS |= dict.fromkeys(
 )
 # The words in the names of outputs.
 _BOX, _SCORE, _LABEL = ("box", "det"), ("score", "conf", "prob", "logit"), ("label", "class", "cls")
-_POINT, _COUNT = ("keypoint", "kpt"), ("num", "valid_det")
+_POINT, _COUNT = ("keypoint", "kpt"), ("num", "valid_det", "count")
 _PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
 _MOST = 1000  # boxes, of which none shows a thing that another one shows
 # How sure a form is: by all that is there, one of several that fit, or only if it is asked for.

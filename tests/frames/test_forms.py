@@ -72,14 +72,8 @@ def beside(*parts):
 
 
 def cell_row(width, *, first=()):
-    return lambda x, y, s: [
-        (x + 0.5) * s,
-        (y + 0.5) * s,
-        s,
-        s,
-        *first,
-        *[0.01] * (width - len(first)),
-    ]
+    rest = [*first, *[0.01] * (width - len(first))]
+    return lambda x, y, s: [(x + 0.5) * s, (y + 0.5) * s, s, s, *rest]
 
 
 def yolo(rows):
@@ -106,10 +100,8 @@ def nanodet():
     for k, distances in enumerate(near):
         at = int(np.argmin(distances))
         x, y, s = strides[at]
-        box = BOXES[k]
-        for side, length in enumerate(
-            (x * s - box[0], y * s - box[1], box[2] - x * s, box[3] - y * s)
-        ):
+        x0, y0, x1, y1 = BOXES[k]
+        for side, length in enumerate((x * s - x0, y * s - y0, x1 - x * s, y1 - y * s)):
             low, part = divmod(length / s, 1)
             share = np.full(8, 1e-9)
             share[int(low)], share[int(low) + 1] = 1 - part, max(part, 1e-9)
@@ -264,13 +256,9 @@ FORMS = {
     "D-FINE of transformers": (
         dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine"),
     ),
-    "TensorFlow": (
-        {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
-         "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0)}, {},
-    ),
     "TensorFlow with masks of boxes, and keypoints": (
-        {"detection_boxes": IN_PARTS[:, YX], "detection_scores": SCORES,
-         "detection_classes": LABELS * 1.0, "num_detections": np.array([K * 1.0]),
+        {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
+         "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0),
          "detection_masks": UPPER, "detection_keypoint_scores": POINTS[..., 2],
          "detection_keypoints": POINTS[..., 1::-1] / SIZE, "raw_detection_boxes": IN_PARTS}, {},
     ),
@@ -317,7 +305,7 @@ ASKED = {
     "RT-DETR of Ultralytics, 2 classes", "RT-DETR of Ultralytics, one class",
     "RT-DETR of Ultralytics, the best", "RT-DETR of Ultralytics, older", "RF-DETR",
     "RF-DETR with a column for nothing, and keypoints", "RF-DETR segment", "DETR", "DETR, told",
-    "D-FINE of transformers", "TensorFlow", "TensorFlow with masks of boxes, and keypoints",
+    "D-FINE of transformers", "TensorFlow with masks of boxes, and keypoints",
     "EfficientDet",
 }  # fmt: skip
 ALL = FORMS | FLAT
