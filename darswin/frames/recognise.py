@@ -150,7 +150,7 @@ def _separate(network: Network) -> Candidates:
         *of, width = outputs[boxes].shape or (0,)
         if width not in (4, 5) or len(of) not in (1, 2) or _says(boxes, *_SCORE):
             continue
-        more = _beside(outputs, of, boxes)
+        more = _beside(network, of, boxes)
         rest = [
             name for name in outputs if name not in {boxes, *(read for read, _ in more.values())}
         ]
@@ -198,10 +198,10 @@ def _by_class(network: Network, boxes: str, scores: str, more: Where) -> Candida
         yield SURE if kind == "sigmoid" else usual, form
 
 
-def _beside(outputs: Outputs, of: Sequence[int], boxes: str) -> Where:
+def _beside(network: Network, of: Sequence[int], boxes: str) -> Where:
     """Masks, keypoints and the number of things beside boxes (…, N, 4); `of` is (…, N)."""
-    parts: dict[str, str] = {}
-    for name, values in outputs.items():
+    (height, width), parts = network.size, dict[str, str]()
+    for name, values in network.outputs.items():
         rest, same = values.shape[len(of) :], values.shape[: len(of)] == (*of,)
         if _says(name, *_COUNT) or (values.dtype.kind in "iu" and not same):
             if values.size == math.prod(of[:-1]):
@@ -212,9 +212,10 @@ def _beside(outputs: Outputs, of: Sequence[int], boxes: str) -> Where:
             parts["point_scores"] = name
         elif len(rest) == 2 and rest[1] in (2, 3):
             parts["points"] = name
-        elif len(rest) in (2, 3) and rest[-3:-2] in ((), (1,)) and not _says(name, *_POINT):
-            parts["masks"] = name
-    if "points" not in parts or outputs[parts["points"]].shape[-1] != 2:
+        elif len(rest) in (2, 3) and rest[-3:-2] in ((), (1,)):
+            is_square = rest[-2] in (rest[-1], rest[-1] * height / width)
+            parts |= {"masks": name} if is_square or _says(name, "mask") else {}
+    if "points" not in parts or network.outputs[parts["points"]].shape[-1] != 2:
         parts.pop("point_scores", None)
     return _whole(**parts)
 
