@@ -72,13 +72,14 @@ def form_of(network: Network, word: str | None = None) -> Form | None:
     best = max((how for how, _ in fitting), default=ASKED)
     forms = [form for how, form in fitting if word or how == best > ASKED]
     words = [*dict.fromkeys(form.name for form in forms)]
+    if not words or all(values.ndim < 3 for values in network.outputs.values()):
+        words.append("numbers")
     if word in FORMS[:-1]:
-        check("form", word, word in words, f"one that its outputs may have, {_or(words)}")
+        check("form", word, word in words, f"one that its outputs may have, {' or '.join(words)}")
         forms = [form for form in forms if form.name == word]
     elif best == PERHAPS:
-        words += ["numbers"] * all(values.ndim < 3 for values in network.outputs.values())
-        text = f"their form may be {_or(words)}: say which by `form`, or keep what tells it, the "
-        text += "metadata that `yolo export` writes, or transformers' config.json beside the file"
+        text = f"their form may be {' or '.join(words)}: say which by `form`, or keep what tells "
+        text += "it: the metadata of `yolo export`, or transformers' config.json beside the file"
         raise naming(ValueError(text), "form")
     for form in forms[:1]:
         count = network.outputs[form.where["boxes"][0]].shape[-1 if form.things_last else -2]
@@ -90,10 +91,6 @@ def form_of(network: Network, word: str | None = None) -> Form | None:
 def unused(form: Form, outputs: Collection[str]) -> list[str]:
     """The outputs that the form does not read."""
     return [name for name in outputs if name not in {of for of, _ in form.where.values()}]
-
-
-def _or(words: Sequence[str]) -> str:
-    return " or ".join((", ".join(words[:-1]), words[-1]) if len(words) > 1 else words) or "numbers"
 
 
 def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:

@@ -16,7 +16,9 @@ pytest.importorskip("onnxruntime")
 
 from graphs import write_detector
 
+from darswin.frames.forms import decode
 from darswin.frames.onnx import OnnxNetwork
+from darswin.frames.recognise import Network, form_of
 
 pytestmark = pytest.mark.unsanitized  # nothing of it is compiled
 
@@ -160,9 +162,7 @@ FORMS = {
              labels=full(LABELS).astype(int), keypoints=full(POINTS)), {},
     ),
     "table": (dict(out=full(ROWS)), {}),
-    "table in parts": (
-        dict(out=full(beside(IN_PARTS, SCORES, LABELS))), dict(form="table"),
-    ),
+    "table in parts": (dict(out=full(beside(IN_PARTS, SCORES, LABELS))), dict(form="table")),
     "table of all cells": (dict(out=full(ROWS, 735)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
     "detect without task": (
@@ -182,15 +182,12 @@ FORMS = {
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
     "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=protos(16)),
-        of("segment"),
+        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=protos(16)), of("segment"),
     ),
     "pose, end to end": (
         dict(output0=full(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
     ),
-    "obb, end to end": (
-        dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
-    ),
+    "obb, end to end": (dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb")),
     "RT-DETR of Ultralytics": (
         dict(output0=full(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
     ),
@@ -245,9 +242,7 @@ FORMS = {
              keypoints=np.concatenate((POINTS[..., :2] / SIZE[::-1], POINTS[..., 2:]), 2)),
         dict(metadata={"names": NAMES}),
     ),
-    "RT-DETR": (
-        dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes"),
-    ),
+    "RT-DETR": (dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes")),
     "DETR": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS), dict(model_type="detr", masked=True)),
     "DETR, told": (
         dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))),
@@ -267,9 +262,7 @@ FORMS = {
     "MMDeploy with masks of boxes": (
         dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=UPPER), {},
     ),
-    "MMPose with keypoints, one class": (
-        dict(dets=beside(BOXES, SCORES), keypoints=POINTS), {},
-    ),
+    "MMPose with keypoints, one class": (dict(dets=beside(BOXES, SCORES), keypoints=POINTS), {}),
     "EfficientNMS": (
         dict(num_dets=np.array([K]), det_boxes=full(BOXES, 100),
              det_scores=full(SCORES, 100) - (np.arange(100) >= K),
@@ -402,13 +395,30 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         check_known(form, found)
 
 
-@pytest.mark.parametrize("last", [17.0, 1.0])
-def test_scores_of_1_are_no_classes(tmp_path, last):
-    """In tables with the number of the picture, whose class may stand before the score or after."""
-    row = [0, 10, 20, 30, 40, 18.0 - last, last]
-    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row] * 2, np.float32)})
-    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
-    assert (found.labels.tolist(), found.scores.tolist()) == ([17] * 2, [1] * 2)
+def test_what_a_black_picture_leaves_open_the_first_things_tell():
+    """And it is kept: what does not fit then is an error."""
+    some, parts = dict(a=BOXES, b=LABELS, c=SCORES), dict(a=IN_PARTS, b=LABELS, c=SCORES)
+    for black in (0, 1, 2):
+        outputs = {name: 0 * values[:black] for name, values in some.items()}
+        form = form_of(Network(outputs, SIZE, {}, 0, ()))
+        for first, other in ((some, some), (parts, parts), (parts, some)):
+            kept, (found,) = decode(form, first, 1, SIZE, 0.3)
+            check_known("own", found)
+            if first is other:
+                check_known("own", decode(kept, other, 1, SIZE, 0.3)[1][0])
+            else:
+                said = "boxes must be parts of the picture, but reach"
+                refused(said, decode, kept, other, 1, SIZE, 0.3)
+    flat = Network(dict(a=np.zeros((0, 7))), SIZE, {}, 0, ())
+    for pair, label, score in (
+        ((1, 17), 17, 1), ((17, 1), 17, 1), ((0.5, 0), 0, 0.5), ((1, 0), 0, 1), ((1, 1), 1, 1)
+    ):  # fmt: skip
+        rows = np.array([[0, 10, 20, 30, 40, *pair]], np.float16)
+        form, (found,) = decode(form_of(flat), dict(a=rows), 1, SIZE, 0.3)
+        assert (found.labels, found.scores) == (label, score)
+        assert ("either" in form.where) == (pair == (1, 1))  # both are the same
+    rows[0, 5:] = 17, 1.5
+    refused(r"score up to 1 and a class, got 17, 1\.5", decode, form, dict(a=rows), 1, SIZE, 0.3)
 
 
 @pytest.mark.filterwarnings("error")
@@ -427,7 +437,7 @@ def test_logits_may_be_very_low(tmp_path):
 def test_words_that_do_not_fit_are_told(tmp_path):
     for form, word, said in (
         ("detect", "pose", "`form` must be one that its outputs may have, detect, got pose"),
-        ("table", "pose", "may have, detect, rtdetr or table, got pose"),
+        ("table", "pose", "may have, detect or rtdetr or table, got pose"),
         ("own", "sigmoid", "may have, boxes, got sigmoid"),
         ("own", "tanh", "`form` must be one of detect, pose, .*, numbers, got tanh"),
         ("own", "numbers", "known are the forms"),
@@ -451,9 +461,17 @@ def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):
 def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
     seven = np.array([[0.0, 0.5, 0.1, 0.1, 0.1, 0.15, 0.05]], np.float32)  # as of emotions
     pooled = np.zeros((1, 1, 5, 7), np.float32)  # a map of a 32nd
-    for value, kind in ((seven, "numbers"), (pooled, "maps")):
-        path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
-        assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
+    best = dict(score=np.full(1, 0.6, np.float32), label=np.array([2]))  # of a classifier
+    four = np.array([[0.1, 0.2, 3.0, 0.5]], np.float32)
+    for outputs, kind, word in (
+        (dict(out=seven), "numbers", None), (dict(out=pooled), "maps", None),
+        (best | dict(logits=four), "numbers", None),
+        (best | dict(a=four[:, ::-1]), "numbers", None),
+        (best | dict(a=four), "numbers", "numbers"),
+    ):  # fmt: skip
+        network = OnnxNetwork(write_detector(tmp_path / "n.onnx", SIZE, outputs), form=word)
+        assert (network.kind, network.form) == (kind, None)
+    refused("may be boxes or numbers: say which by `form`", OnnxNetwork, tmp_path / "n.onnx")
 
 
 def test_boxes_of_cells_are_corners_with_probabilities(tmp_path):
