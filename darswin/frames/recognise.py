@@ -235,7 +235,7 @@ def _tables(network: Network) -> Candidates:
         where = _columns(name, image=1, boxes=4, scores=1, labels=1)
         is_sure = name not in network.batched or not len(values)
         yield SURE if is_sure else PERHAPS, Form("flat", where | {"either": (name, slice(5, 7))})
-    if len(shape) != 3 or shape[1:] == size:
+    if len(shape) != 3 or shape[1:] == size or values.dtype.kind != "f":  # or a map
         return
     masks, (_, count_of, width) = outputs[protos].shape[1] if protos else 0, shape
     strides, each = grids(size).get(count_of, ((), 0))

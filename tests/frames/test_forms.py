@@ -465,6 +465,7 @@ def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
     four = np.array([[0.1, 0.2, 3.0, 0.5]], np.float32)
     for outputs, kind, word in (
         (dict(out=seven), "numbers", None), (dict(out=pooled), "maps", None),
+        (dict(ids=np.ones((1, 5, 7), np.int64)), "maps", None),
         (best | dict(logits=four), "numbers", None),
         (best | dict(a=four[:, ::-1]), "numbers", None),
         (best | dict(a=four), "numbers", "numbers"),
