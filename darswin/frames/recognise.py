@@ -218,16 +218,20 @@ def _beside(network: Network, of: Sequence[int], boxes: str) -> Where:
 
 
 def _tables(network: Network) -> Candidates:
-    """One table, and perhaps the masks that all things share."""
-    outputs, size = network.outputs, network.size
+    """One table, and perhaps the masks (B, M, H/4, W/4) that all things share."""
+    outputs, quarter = network.outputs, (network.size[0] // 4, network.size[1] // 4)
     count = _one([name for name in outputs if _says(name, *_COUNT) and outputs[name].ndim < 3])
-    protos = _one([name for name in outputs if _is_shared(outputs[name].shape, size)])
+    protos = _one([name for name, values in outputs.items() if values.shape[2:] == quarter])
     name = _one(
         [name for name in outputs if outputs[name].ndim < 5 and name not in (count, protos)]
     )
-    if name is None:
-        return
-    values, shape, more = outputs[name], outputs[name].shape, _whole(protos=protos, count=count)
+    for shared in dict.fromkeys((protos, None)) if name else ():  # or it is another map
+        yield from _table(network, str(name), shared, _whole(protos=shared, count=count))
+
+
+def _table(network: Network, name: str, protos: str | None, more: Where) -> Candidates:
+    outputs, size = network.outputs, network.size
+    values, shape = outputs[name], outputs[name].shape
     if shape[:2] == (1, 1) and shape[3:] == (7,) and size[0] * 7 != size[1] * shape[2]:
         yield SURE, Form("ssd", _columns(name, image=1, labels=1, scores=1, boxes=4))
     is_flat = shape[1:] == (7,) and _are_whole(values[:, 0]) and _are_corners(values[:, 1:])
@@ -266,12 +270,6 @@ def _has_class(values: np.ndarray) -> bool:
     return _are_whole(label) and (not label.any() or _are_corners(values))
 
 
-def _is_shared(shape: Sequence[int], size: Size) -> bool:
-    """Whether an output can be the masks that all things share, (B, M, H/k, W/k)."""
-    parts = [(size[0] // k, size[1] // k) for k in (2, 4, 8)]
-    return len(shape) == 4 and shape[1] > 1 and shape[2:] in parts
-
-
 def _final(network: Network, name: str, masks: int, more: Where) -> Candidates:
     """Rows (B, N, …) of which each is one thing, or all cells."""
     values, task, head = network.outputs[name], network.task, network.metadata.get("head")
@@ -287,10 +285,10 @@ def _final(network: Network, name: str, masks: int, more: Where) -> Candidates:
         is_sure = task and fits and (is_rtdetr or width != 6)
         how = SURE if is_sure else PERHAPS if in_parts and task is None else ASKED
         yield how, Form("rtdetr", _columns(name, boxes=4, **columns) | more, "middle", True)
-    if width == 6:
+    if width == 6 and not masks:
         where = _columns(name, boxes=4, scores=1, labels=1) | more
         yield PERHAPS if in_parts else SURE, Form("table", where)
-    if width == 7:
+    if width == 7 and not masks:
         where = _columns(name, number=1, boxes=4, scores=1, labels=1) | more
         yield SURE if _says(name, "detections") else PERHAPS, Form("efficientdet", where, "rows")
 
@@ -318,5 +316,6 @@ def _ultralytics(
         if forms:
             break
     is_usual = last or masks or total in (7, 57)  # or else they ask for any table
-    is_sure = own or (len(forms) == 1 and (last or masks))
+    has_weights = masks and (network.outputs[name] < 0).any()  # as no probabilities are
+    is_sure = own or (len(forms) == 1 and (has_weights if masks else last))
     yield from ((SURE if is_sure else PERHAPS if is_usual else ASKED, form) for form in forms)

@@ -121,7 +121,7 @@ def protos(count=32):
     return masks
 
 
-WEIGHTS = np.eye(K, 64)
+WEIGHTS = -np.eye(K, 64)
 UPPER = np.zeros((K, 28, 28))  # the upper half of each box
 UPPER[:, :14] = 1
 IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
@@ -162,6 +162,7 @@ FORMS = {
              labels=full(LABELS).astype(int), keypoints=full(POINTS)), {},
     ),
     "table": (dict(out=full(ROWS)), {}),
+    "table beside a map": (dict(out=full(ROWS), features=np.zeros((8, 40, 56))), {}),
     "table in parts": (dict(out=full(beside(IN_PARTS, SCORES, LABELS))), dict(form="table")),
     "table of all cells": (dict(out=full(ROWS, 735)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
@@ -169,9 +170,13 @@ FORMS = {
         dict(output0=yolo(beside(CENTRED, one_hot(80)))),
         dict(metadata={"names": [*NAMES.values()]}),
     ),
+    "detect beside a map": (
+        dict(output0=yolo(beside(CENTRED, one_hot(80))), features=np.zeros((8, 40, 56))),
+        of("detect"),
+    ),
     "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(form="detect")),
     "segment": (
-        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos(64)),
+        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=-protos(64)),
         of("segment"),
     ),
     "pose": (dict(output0=yolo(beside(CENTRED, SCORES, POINTS))), dict(metadata=POSE)),
@@ -182,7 +187,7 @@ FORMS = {
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
     "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=protos(16)), of("segment"),
+        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=-protos(16)), of("segment"),
     ),
     "pose, end to end": (
         dict(output0=full(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
@@ -222,7 +227,7 @@ FORMS = {
     "YOLOv5 segment": (
         dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98),
                                   WEIGHTS[:, :32]),
-                           cell_row(113, first=(0.01,)), each=3), output1=protos()), {},
+                           cell_row(113, first=(0.01,)), each=3), output1=-protos()), {},
     ),
     "YOLOv6": (
         dict(outputs=dense(beside(CENTRED, np.ones(K), one_hot(80)), cell_row(81, first=(1,)))), {},
@@ -293,13 +298,13 @@ FLAT = {
 }  # fmt: skip
 # What is only known by names, metadata or a word, so that it is asked for without them.
 ASKED = {
-    "own, one masked", "table in parts", "detect", "detect without task", "detect of 51", "pose",
-    "pose of 2", "obb", "pose, end to end", "obb, end to end", "RT-DETR of Ultralytics",
-    "RT-DETR of Ultralytics, 2 classes", "RT-DETR of Ultralytics, one class",
-    "RT-DETR of Ultralytics, the best", "RT-DETR of Ultralytics, older", "RF-DETR",
-    "RF-DETR with a column for nothing, and keypoints", "RF-DETR segment", "DETR", "DETR, told",
+    "own, one masked", "table in parts", "detect", "detect beside a map", "detect without task",
+    "detect of 51", "pose", "pose of 2", "obb", "pose, end to end", "obb, end to end",
+    "RT-DETR of Ultralytics", "RT-DETR of Ultralytics, 2 classes",
+    "RT-DETR of Ultralytics, one class", "RT-DETR of Ultralytics, the best",
+    "RT-DETR of Ultralytics, older", "RF-DETR", "RF-DETR segment",
+    "RF-DETR with a column for nothing, and keypoints", "DETR", "DETR, told", "EfficientDet",
     "D-FINE of transformers", "TensorFlow with masks of boxes, and keypoints",
-    "EfficientDet",
 }  # fmt: skip
 ALL = FORMS | FLAT
 
