@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -48,42 +49,29 @@ class Emptied(UserWarning):
 
 
 class Boxes:
-    """Counts the boxes of a network that have no area, and those that are within its first pixels,
-    where nothing is."""
-
-    smallest = 2.0  # px
+    """Counts the boxes of a network, and those that have no area."""
 
     def __init__(self) -> None:
-        self.count = self.without_area = self.in_corner = 0
+        self.count = self.without_area = 0
 
     def add(self, detections: Sequence[Instances]) -> None:
         for boxes in (instances.upright for instances in detections):
-            has_area = (boxes[:, :2] < boxes[:, 2:]).all(1)
-            in_corner = (np.abs(boxes) < self.smallest).all(1)
             self.count += len(boxes)
-            self.in_corner += int(in_corner.sum())
-            self.without_area += int((~has_area & ~in_corner).sum())
+            self.without_area += int((boxes[:, :2] >= boxes[:, 2:]).any(1).sum())
 
     def wrong(self, network: str) -> str | None:
         """What is wrong if most boxes are none; warns if some are."""
-        count = self.without_area + self.in_corner
-        if not count:
+        if not self.without_area:
             return None
         text = (
-            f"{count} of {self.count} boxes of {network} were left out: {self.without_area} "
-            f"without an area, and {self.in_corner} within the first {self.smallest:g} px"
+            f"{self.without_area} of {self.count} boxes of {network} have no area and are left out"
         )
-        if 2 * count <= self.count:
+        if 2 * self.without_area <= self.count:
             warnings.warn(text, Emptied, stacklevel=2)
             return None
-        hints = []
-        if self.without_area:
-            hints.append("centres and sizes, or y before x")
-        if self.in_corner:
-            hints.append("parts of the picture, which its width and height multiply")
         return (
-            f"{text}. They may be {' or '.join(hints)}; the graph must give the corners x0, y0, "
-            "x1, y1 in pixels"
+            f"{text}. They may be centres and sizes, or y before x; the graph must give the "
+            "corners x0, y0, x1, y1"
         )
 
 
@@ -110,7 +98,7 @@ class NetworkAnswers(Answers):
         fov_deg: float | None = None, up: Sequence[float] | None = None,
         mean: Sequence[float] | None = None, std: Sequence[float] | None = None,
         channels: str | None = None, threshold: float | None = None, labels: str | None = None,
-        top: int | None = None, task: Any = None, scores: Any = None,
+        top: int | None = None, form: str | None = None,
         height: float | None = None, radius: float | None = None,
         format: Literal["json", "coco", "yolo"] | None = None,
     ):  # fmt: skip
@@ -122,7 +110,8 @@ class NetworkAnswers(Answers):
         make = partial(named_view, "view", view or VIEW, fov_deg=fov_deg, up=up)
         # The network says how large its pictures are, but the view how many there are.
         try:
-            self.network = OnnxNetwork(network, size, make((64, 64)).count, lowest, task, scores)
+            number = make((64, 64)).count
+            self.network = OnnxNetwork(network, size, number, lowest, form, self.labels)
         except ModuleNotFoundError as error:  # of onnxruntime, and says how to install it
             raise ValueError(str(error)) from error
         super().__init__(self.network.channels)
@@ -173,7 +162,13 @@ class NetworkAnswers(Answers):
         if self.network.output == "image":
             mean, std = (",".join(f"{v:.4g}" for v in part) for part in (pixels.mean, pixels.std))
             values = f"(pixel/255 - mean) / std, mean {mean}, std {std}"
-        return f"detections ({self.network.form}{names}); pixels are {pixels.channels}, {values}"
+        merged = ", boxes that overlap are merged" if self.network.overlaps else ""
+        unused = ", ".join(self.network.unused)
+        return (
+            f"detections (form {self.network.form}{names}{merged}); "
+            + f"outputs that are not used: {unused}; " * bool(unused)
+            + f"pixels are {pixels.channels}, {values}"
+        )
 
     def _class_outputs(self) -> list[str]:
         """The outputs that are numbers of classes, if these were asked for."""
@@ -196,6 +191,7 @@ class NetworkAnswers(Answers):
         """Says where files go, which numbers do not need; names: those of `file_names`."""
         self._out, self._names = out or Path(), names
         self._ids = picture_ids(names.values())
+        self._free_ids = count(max(self._ids.values(), default=0) + 1)
         return self
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
@@ -219,10 +215,12 @@ class NetworkAnswers(Answers):
     def _bound_to(self, size: tuple[int, int], lens: Lens) -> BoundView:
         if isinstance(self.view, PlainView) and size != self.network.size:
             (height, width), (own_height, own_width) = size, self.network.size
-            raise ValueError(
-                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}: "
-                "choose a view that resamples it"
+            text = (
+                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}"
             )
+            text += ": choose a view that resamples it"
+            text += "" if self.network.has_size else f", or give it by `size`, {height},{width}"
+            raise naming(ValueError(text), "size")
         remap = self.view.at(lens, size)
         output = self.network.output
         made = remap.plan(output, mean=self._mean, std=self._std)
@@ -253,7 +251,9 @@ class NetworkAnswers(Answers):
         names = [self._name(label) for label in detections.labels.tolist()]
         name, size = file_of(entry, self._names), (image.shape[0], image.shape[1])
         if self._format == "coco":
-            of = {"image_id": self._ids.get(name, name)}
+            if name not in self._ids:
+                self._ids[name] = next(self._free_ids)
+            of = {"image_id": self._ids[name], "file_name": name}
             self._results += [of | result for result in coco_annotations(detections)]
         if self._format == "yolo":
             replace_file(self._out / f"labels/{name}.txt", yolo_lines(detections, size))

@@ -110,9 +110,7 @@ def predict_network(
     up: tuple[float, float, float] | None = None, mean: Sequence[float] | None = None,
     std: Sequence[float] | None = None, channels: Literal["rgb", "bgr"] | None = None,
     threshold: float | None = None, labels: str | None = None, top: int | None = None,
-    task: Literal["detect", "pose", "obb", "segment"] | None = None,
-    scores: Literal["softmax", "sigmoid"] | None = None,
-    height: float | None = None, radius: float | None = None,
+    form: str | None = None, height: float | None = None, radius: float | None = None,
     format: Literal["json", "coco", "yolo"] | None = None, every: int = 1, out: str | None = None,
 ) -> list[dict]:  # fmt: skip
     """Runs any network in an ONNX file, such as a detector, on a view of pictures and video frames,
@@ -147,9 +145,9 @@ def predict_network(
             {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt). The default
             is the names in the file of the network, if it has any.
         top: the number of classes to list for each image, if the network gives numbers of classes.
-        task: of a network of Ultralytics whose file lost its metadata.
-        scores: what makes probabilities of the logits of a DETR of transformers, if no config.json
-            is beside the file.
+        form: of the outputs of a detector, if they do not tell it: detect, pose, obb or segment of
+            Ultralytics, softmax or sigmoid of the logits of transformers, or another word of the
+            how-to about detectors; numbers if the network is no detector.
         height: of the camera above a flat floor, in metres. Each detection then tells where it
             stands: "floor" is metres to the right and ahead of the camera. It needs `up`.
         radius: of things on the floor, in metres: 0.25 suits people. The default is 0, for their
@@ -167,15 +165,12 @@ def predict_network(
 
     answers = NetworkAnswers(
         network, view=view, size=size, fov_deg=fov_deg, up=up, mean=mean, std=std,
-        channels=channels, threshold=threshold, labels=labels, top=top, task=task, scores=scores,
+        channels=channels, threshold=threshold, labels=labels, top=top, form=form,
         height=height, radius=radius, format=format,
     )  # fmt: skip
-    kind = answers.network.kind
-    if task is not None and kind != "detections":
-        raise ValueError(f"--task is {task}, but {network} is a model for {kind}")
     lenses_of = partial(given_lenses, str(lens), camera, coefficients)
     read = [network, str(lens)]
-    return _predict(paths, kind, answers.into, lenses_of, read, top, every, out)
+    return _predict(paths, answers.network.kind, answers.into, lenses_of, read, top, every, out)
 
 
 COMMANDS = {"": predict, "--network": predict_network}

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from darswin.boxes import Instances
 Outputs = Mapping[str, np.ndarray]
 Size = tuple[int, int]
 Where = dict[str, tuple[str, slice]]
+_PART = 1.5  # coordinates in parts of the picture end there: boxes need not be cut at its border
+_BOX_MASK = 33  # px: no mask of a whole picture is that small, unless the picture is
 
 
 class Pixels(NamedTuple):
@@ -30,11 +33,13 @@ class Form:
     """The form of a detector's outputs.
 
     Attributes:
-        name: whose it is.
-        where: the output and the columns of each part of a detection.
+        name: a word of `darswin.frames.recognise.FORMS`.
+        where: the output and the columns of each part of a detection; "either" are those of score
+            and class, whose order the first rows tell.
         code: how boxes are written: corners x0, y0, x1, y1; rows y0, x0, y1, x1; middle and size;
             or relative to the cells of grids, as yolox or nanodet do.
-        in_parts: boxes are parts of the picture, not pixels.
+        in_parts, points_in_parts: boxes and keypoints are parts of the picture, not pixels; None
+            until the first of them tell it.
         scores: softmax or sigmoid, which makes probabilities of the scores; "" if they are some.
         things_last: the last axis counts the things.
         overlaps: several boxes show one thing, so `darswin.boxes.merge` must keep the best.
@@ -45,7 +50,8 @@ class Form:
     name: str
     where: Where
     code: str = "corners"
-    in_parts: bool = False
+    in_parts: bool | None = None
+    points_in_parts: bool | None = None
     scores: str = ""
     things_last: bool = False
     overlaps: bool = False
@@ -71,59 +77,125 @@ def cells(size: Size, strides: Sequence[int]) -> np.ndarray:
     return np.concatenate(each)
 
 
+@np.errstate(invalid="ignore", over="ignore")  # the caller tells of them
 def decode(
     form: Form, outputs: Outputs, count: int, size: Size, threshold: float
-) -> list[Instances]:
-    """The detections in each of `count` pictures of (H, W) whose score is not below `threshold`.
+) -> tuple[Form, list[Instances]]:
+    """The detections in each of `count` pictures of (H, W) whose score is not below `threshold`;
+    and the form, with what these tell of it.
 
     Boxes are turned, (K, 5), if the network turns them; masks are the probabilities of pixels.
 
     Raises:
-        ValueError: the outputs are of another number of pictures.
+        ValueError: the outputs are of another number of pictures, or not of this form.
     """
+    if "either" in form.where:
+        form = _with_order(form, outputs)
+    pictures = [_kept(form, parts, size, threshold) for parts in _pictures(form, outputs, count)]
+    units = [
+        _in_parts(known, name, [kept[name] for kept in pictures if name in kept])
+        for known, name in ((form.in_parts, "boxes"), (form.points_in_parts, "points"))
+    ]
+    form = replace(form, in_parts=units[0], points_in_parts=units[1])
+    return form, [_instances(form, kept, size) for kept in pictures]
+
+
+def _pictures(form: Form, outputs: Outputs, count: int) -> list[dict[str, np.ndarray]]:
+    """The parts of each picture, a row for each thing."""
     parts = {}
     for key, (name, columns) in form.where.items():
         values = outputs[name]
         if form.things_last and values.ndim == 3:
             values = values.swapaxes(1, 2)
-        parts[key] = values[..., columns] if values.ndim else values
+        parts[key] = values.reshape(-1) if key == "count" else values[..., columns]
     if "image" in parts:
         rows = {key: values.reshape(-1, values.shape[-1]) for key, values in parts.items()}
         number = rows["image"][:, 0]
-        pictures = [{k: of[number == p] for k, of in rows.items()} for p in range(count)]
-    elif parts["boxes"].ndim == 2:
-        pictures = [parts]
-    else:
-        pictures = [{k: of[p] for k, of in parts.items()} for p in range(len(parts["boxes"]))]
-    if len(pictures) != count:
-        raise ValueError(f"it gives the boxes of {len(pictures)} pictures for {count}")
-    return [_decoded(form, picture, size, threshold) for picture in pictures]
+        return [{key: of[number == k] for key, of in rows.items()} for k in range(count)]
+    batch = 1 if parts["boxes"].ndim == 2 else len(parts["boxes"])
+    if batch != count:
+        raise ValueError(f"it gives the boxes of {batch} pictures for {count}")
+    if parts["boxes"].ndim == 2:
+        return [parts]
+    return [{key: of[k] for key, of in parts.items()} for k in range(count)]
 
 
-@np.errstate(invalid="ignore", over="ignore")  # the caller tells of them
-def _decoded(form: Form, parts: dict[str, np.ndarray], size: Size, threshold: float) -> Instances:
-    rows, scores = len(parts["boxes"]), parts["scores"].astype(float)
-    scores = scores[:, None] if scores.ndim == 1 else scores
+def orders_of(pairs: np.ndarray) -> list[int]:
+    """The columns, 0 or 1, of pairs (N, 2) that can be scores while the others are classes."""
+    both = (pairs.T, pairs.T[::-1])
+    return [
+        k for k, (score, label) in enumerate(both)
+        if ((score > 0) & (score <= 1)).all() and not (label % 1).any()
+    ]  # fmt: skip
+
+
+def _with_order(form: Form, outputs: Outputs) -> Form:
+    """The form with its score and its class where the rows have them, if they are not equal."""
+    name, columns = form.where["either"]
+    pairs = outputs[name][..., columns]
+    if not (orders := orders_of(pairs)):
+        text = ", ".join(f"{value:g}" for value in pairs[0])
+        raise ValueError(f"its last columns must be a score up to 1 and a class, got {text}")
+    score, label = columns.start + orders[0], columns.start + 1 - orders[0]
+    where = dict(scores=(name, slice(score, score + 1)), labels=(name, slice(label, label + 1)))
+    where |= {} if len(orders) == 1 else {"either": (name, columns)}
+    return replace(form, where={k: v for k, v in form.where.items() if k != "either"} | where)
+
+
+def _kept(
+    form: Form, parts: dict[str, np.ndarray], size: Size, threshold: float
+) -> dict[str, np.ndarray]:
+    """The parts of the things that are detections, with one score and one label each."""
+    rows = len(parts["boxes"])
+    scores = parts["scores"].astype(float).reshape(rows, -1 if rows else 1)
     if form.scores == "softmax":  # the last class is nothing
         scores = np.exp(scores - scores.max(-1, keepdims=True))
         scores = (scores / scores.sum(-1, keepdims=True))[:, :-1]
+    for values in (scores, parts.get("objectness", scores)) if form.overlaps else ():
+        low, high = values.min(initial=0), values.max(initial=0)
+        if low < -0.01 or high > 1.01:
+            raise ValueError(
+                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
+                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
+            )
     labels = parts["labels"].reshape(rows) if "labels" in parts else scores.argmax(-1)
     score = scores.max(-1)
-    # SuperGradients has the class after the score.
-    if "image" in parts and ((labels % 1).any() or (score > 1).any()):
-        labels, score = score, labels
     if form.scores == "sigmoid":
         score = 1 / (1 + np.exp(-score))
     if "objectness" in parts:
         score = score * parts["objectness"][:, 0]
     keep = ~(score < threshold)
     if "count" in parts:
-        keep[int(parts["count"].reshape(-1)[0]) :] = False
-    kept = {key: v[keep] for key, v in parts.items() if key not in ("count", "protos")}
-    boxes = kept["boxes"].astype(float)
+        used = int(parts["count"].max())
+        if not 0 <= used <= rows:
+            raise ValueError(f"it says that {used} of {rows} boxes are things")
+        keep[used:] = False
+    parts = parts | {"scores": score, "labels": labels}
     if form.code in ("yolox", "nanodet"):
-        *corner, stride = cells(size, grids(size)[rows][0])[keep].T[..., None]
-        corner = np.concatenate(corner, -1)
+        parts["cells"] = cells(size, grids(size)[rows][0])
+    if "points" in parts:
+        points = parts["points"]
+        width = points.shape[2] if points.ndim == 3 else form.point
+        parts["points"] = points.reshape(rows, math.prod(points.shape[1:]) // width, width)
+    whole = ("count", "protos")
+    return {key: values if key in whole else values[keep] for key, values in parts.items()}
+
+
+def _in_parts(known: bool | None, name: str, tables: Sequence[np.ndarray]) -> bool | None:
+    """Whether coordinates are parts of the picture, by the first ones; None without any."""
+    most = 0.0
+    for table in tables:
+        places = np.abs(table[..., : 4 if name == "boxes" else 2].astype(float))
+        most = max(most, places[np.isfinite(places)].max(initial=0))
+    if known and most > 2 * _PART:
+        raise ValueError(f"its {name} must be parts of the picture, but reach {most:g} times it")
+    return bool(most <= _PART) if known is None and most else known
+
+
+def _instances(form: Form, kept: dict[str, np.ndarray], size: Size) -> Instances:
+    boxes = kept["boxes"].astype(float)
+    if "cells" in kept:
+        corner, stride = kept["cells"][:, :2], kept["cells"][:, 2:]
         if form.code == "yolox":
             boxes = np.concatenate((boxes[:, :2] + corner, np.exp(boxes[:, 2:])), -1) * stride
         else:
@@ -142,33 +214,49 @@ def _decoded(form: Form, parts: dict[str, np.ndarray], size: Size, threshold: fl
         boxes = np.concatenate((middle - half, middle + half), -1)
     points = kept.get("points")
     if points is not None:
-        width = points.shape[2] if points.ndim == 3 else form.point
-        shape = len(boxes), math.prod(points.shape[1:]) // width, width
-        points = points.reshape(shape).astype(float)
-    masks = _masks(form, parts, kept, boxes, size)
-    return Instances(boxes, score[keep], labels[keep], points, masks)
+        points = points.astype(float)
+        if form.code == "rows":
+            points[..., :2] = points[..., 1::-1]
+        if form.points_in_parts:
+            points[..., :2] *= size[::-1]
+        if "point_scores" in kept:
+            points = np.concatenate((points, kept["point_scores"][..., None]), -1)
+    masks = _masks(form, kept, boxes, size)
+    return Instances(boxes, kept["scores"], kept["labels"], points, masks)
 
 
-def _masks(
-    form: Form, parts: Outputs, kept: Outputs, boxes: np.ndarray, size: Size
-) -> np.ndarray | None:
-    """The masks of instances, as they are or of those that all share; None without any."""
+def _masks(form: Form, kept: Outputs, boxes: np.ndarray, size: Size) -> np.ndarray | None:
+    """The masks of instances, as they are, of those that all share, or each of its box alone; None
+    without any."""
     masks: np.ndarray
-    if "protos" in parts:
-        weights, protos = kept["weights"], parts["protos"]
+    if "protos" in kept:
+        weights, protos = kept["weights"], kept["protos"]
         masks = np.tensordot(weights.astype(np.float32), protos.astype(np.float32), 1)
     elif "masks" in kept:
         masks = kept["masks"]
         masks = masks.reshape(len(boxes), *masks.shape[-2:]).astype(np.float32)
     else:
         return None
-    scale = size[0] / masks.shape[1]
-    if scale % 1 or masks.shape[2] * scale != size[1]:
-        return None  # each of its box alone
-    if "protos" in parts or form.scores:
+    if "protos" in kept or form.scores:
         masks = 1 / (1 + np.exp(-masks))
-    if "protos" in parts:  # they have meaning inside the box only
+    scale = size[0] / masks.shape[1]
+    is_whole = scale % 1 == 0 and masks.shape[2] * scale == size[1]
+    is_small = scale > 4 and max(masks.shape[1:]) <= _BOX_MASK
+    if "masks" in kept and (is_small or not is_whole):
+        boxes = boxes.clip(-1e6, 1e6)  # they may end nowhere
+        pasted = [*map(partial(_pasted, size=size), masks, boxes)]
+        return np.array(pasted, np.float32).reshape(-1, *size)
+    if "protos" in kept:  # they have meaning inside the box only
         x0, y0, x1, y1 = boxes.T[..., None, None] / scale - 0.5
         y, x = np.ogrid[: masks.shape[1], : masks.shape[2]]
         masks *= (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)
     return masks
+
+
+def _pasted(mask: np.ndarray, box: np.ndarray, size: Size) -> np.ndarray:
+    """The mask of a box in a picture (H, W), in between its pixels by both nearest ones."""
+    weights = []
+    for low, high, pixels, side in zip(box[1::-1], box[3:1:-1], mask.shape, size, strict=True):
+        places = (np.arange(side) + 0.5 - low) / max(high - low, 1e-9) * pixels - 0.5
+        weights.append(np.maximum(0, 1 - np.abs(places[:, None] - np.arange(pixels))))
+    return weights[0] @ mask @ weights[1].T

@@ -1,9 +1,9 @@
 """Any network of pictures in an ONNX file, run by ONNX Runtime; needs NumPy and onnxruntime."""
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from darswin.boxes import Instances
 from darswin.frames.forms import RGB, Form, decode
-from darswin.frames.recognise import SCORES, TASKS, form_of, imgsz_of, names_of
+from darswin.frames.recognise import FORMS, Network, form_of, imgsz_of, names_of, unused
 from darswin.utils.extras import lack
 from darswin.utils.files import check_is_file
 from darswin.utils.parameters import check, naming
@@ -30,6 +30,17 @@ _KNOWN = (
     "Another detector needs its decoder in the graph: boxes (B, N, 4), scores (B, N) and labels "
     "(B, N) by these names, or one output (B, N, 6) of x0, y0, x1, y1, score and class"
 )
+
+
+# What is given in place of an ONNX file, by its first bytes.
+_OTHERS = {
+    "a pointer of Git LFS in place of the network: run `git lfs pull`": rb"version https://git-lfs",
+    "a page of HTML or XML, not a network: perhaps its download failed":
+        rb"(\xef\xbb\xbf)?\s*<(!doctype|!--|\?xml|html|head)",
+    "a file of another kind, such as a checkpoint of torch or Keras: export the network to ONNX":
+        rb"PK\x03\x04|\x80[\x02-\x05]|\x1f\x8b|\x89HDF|ftrt|.{4}TFL3|.{7}\0\{",
+    "text, not a network in ONNX": rb"[^\x00-\x08\x0e-\x1f]{9,}\Z",
+}  # fmt: skip
 
 
 class OnnxNetwork:
@@ -53,44 +64,46 @@ class OnnxNetwork:
             Ultralytics, one of which must then have one.
         count: the usual number of pictures in a call. They are one batch if the network takes it.
         threshold: the lowest score of a detection. Others are left out.
-        task: detect, pose, obb or segment, of a file of Ultralytics that lost its metadata.
-        scores: softmax or sigmoid, which makes probabilities of the logits of transformers.
+        form: of the outputs of a detector that do not tell it, a word of the how-to about
+            detectors; "numbers" if it is none.
+        names: of the classes, by their numbers. The default are those of the file.
 
     Raises:
         ModuleNotFoundError: onnxruntime is not installed.
         ValueError: the file is no ONNX file that onnxruntime can run, its inputs or outputs are of
-            no known form, or of several, or the size is missing or not that of the graph.
+            no known form, or of several, or the size is missing or not one that the graph takes.
         FloatingPointError: the network computes NaN or infinity. Boxes may be infinite.
         TypeError: in a call, the pictures are not those of `output`.
 
     Attributes:
-        size: (H, W) of the pictures. channels: 1 or 3. batch: the number of pictures in a run.
+        size: (H, W) of the pictures; has_size: whether the graph takes no others.
+        channels: 1 or 3. batch: the number of pictures in a run.
         output: the output of a `darswin.frames.Plan` that the network takes, "uint8" or "image".
         kind: "detections", "maps", or "numbers".
         shapes: the shapes of the outputs for one picture, by name; empty for a detector.
-        form: the name of a detector's form, or None. overlaps: whether several boxes show one
+        form: the word for a detector's form, or None. overlaps: whether several boxes show one
             thing, and `darswin.boxes.merge(…, inside=1)` must keep the best.
-        names: the names of the classes, by their numbers, as far as the file has them.
+        unused: the names of outputs that a detector has beside this form.
+        names: the names of the classes, by their numbers, as far as they are known.
         pixels: what networks of this form expect: a named tuple of mean, std and channels.
     """
 
     def __init__(
         self, path: str | os.PathLike, size: tuple[int, int] | None = None, count: int = 1,
-        threshold: float = 0.3, task: Literal["detect", "pose", "obb", "segment"] | None = None,
-        scores: Literal["softmax", "sigmoid"] | None = None,
+        threshold: float = 0.3, form: str | None = None, names: Mapping[int, str] | None = None,
     ):  # fmt: skip
         if (without := lack("onnx", ("onnxruntime",))) is not None:
             raise ModuleNotFoundError(without)
-        check("task", task, task in (None, *TASKS), f"one of {', '.join(TASKS)}")
-        check("scores", scores, scores in (None, *SCORES), f"one of {', '.join(SCORES)}")
+        check("form", form, form in (None, *FORMS), f"one of {', '.join(FORMS)}")
         self.path, self.threshold = os.fspath(path), threshold
         self._session = _session(self.path)
         self._metadata = self._read_metadata()
-        self.names = names_of(self._metadata)
+        self.names = dict(names or names_of(self._metadata))
         own, batch = self._read_input()
-        if size is None and None in own:
+        self.has_size = None not in own
+        if size is None and not self.has_size:
             size = imgsz_of(self._metadata)
-        if size is None and None in own:
+        if size is None and not self.has_size:
             text = f"missing `size`: {self.path} takes pictures of any size, so choose one"
             raise naming(ValueError(text), "size")
         if size is not None:
@@ -99,9 +112,7 @@ class OnnxNetwork:
             check("size", ",".join(map(str, size)), fits, f"{wanted} for {self.path}")
         self.size: tuple[int, int] = size or own
         self._form: Form | None = None
-        self._see = partial(form_of, size=self.size, metadata=self._metadata, task=task,
-                            scores=scores)  # fmt: skip
-        self._is_seen = False
+        self._asked, self._is_seen = form, False
         black = np.zeros((count, self.channels, *self.size), np.float32)
         self.batch = batch or (count if count > 1 and self._takes(black) else 1)
         answers = self(black)
@@ -109,6 +120,8 @@ class OnnxNetwork:
         self.form = None if self._form is None else self._form.name
         self.overlaps = self._form is not None and self._form.overlaps
         self.pixels = RGB if self._form is None else self._form.pixels
+        outputs = [put.name for put in self._session.get_outputs()]
+        self.unused: list[str] = [] if self._form is None else unused(self._form, outputs)
         self.kind: Literal["detections", "maps", "numbers"] = "detections"
         self.shapes: dict[str, tuple[int, ...]] = {}
         if isinstance(answers, dict):
@@ -140,6 +153,11 @@ class OnnxNetwork:
                 "(B, C, H, W) or (B, H, W, C) of float or uint8, and may have " + ", ".join(_SIZES)
             )
         self._more_inputs = sizes
+        first_axes = {put.name: put.shape[0] for put in self._session.get_outputs() if put.shape}
+        self._batched = {  # the outputs whose first axis counts the pictures
+            name for name, axis in first_axes.items()
+            if len(axes) == 3 or (axis is not None and axis == first.shape[0])
+        }  # fmt: skip
         self._input, self._type, self._is_single = first.name, _TYPES[first.type], len(axes) == 3
         batch, *rest = [1] * self._is_single + axes
         self._is_last = rest[2] in _CHANNELS and rest[0] not in _CHANNELS
@@ -188,7 +206,7 @@ class OnnxNetwork:
         try:
             values = self._session.run(None, puts)
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
-            raise ValueError(f"onnxruntime cannot run {self.path}: {_line(error)}") from error
+            raise self._error(f"onnxruntime cannot run {self.path}: {_line(error)}") from error
         outputs = {
             put.name: np.asarray(value)[None] if self._is_single else np.asarray(value)
             for put, value in zip(self._session.get_outputs(), values, strict=True)
@@ -199,6 +217,14 @@ class OnnxNetwork:
             shapes = [f"{name} {_text(value.shape)}" for name, value in outputs.items()]
             text = f"{self.path} has the outputs {', '.join(shapes)}; {error}"
             raise ValueError(text) from error
+
+    def _error(self, text: str) -> ValueError:
+        """An error that the size may cause, if the graph leaves it free."""
+        height, width = self.size
+        hint = (
+            f". Perhaps {height},{width} is no `size` that it takes: mostly it has multiples of 32"
+        )
+        return naming(ValueError(text + hint * (not self.has_size)), "size")
 
     def _sizes(self, count: int) -> dict[str, np.ndarray]:
         """The inputs beside the pictures, which tell their size."""
@@ -217,12 +243,14 @@ class OnnxNetwork:
         if any(value.dtype.kind not in "biuf" for value in outputs.values()):
             raise ValueError(_KNOWN)
         if self._form is None and not self._is_seen:
-            self._form = self._see(outputs)
+            classes = max(self.names, default=-1) + 1
+            network = Network(outputs, self.size, self._metadata, classes, self._batched)
+            self._form = form_of(network, self._asked)
         if self._form is None:
             if not (others := self._others(outputs, count)):
-                raise ValueError(_KNOWN)
+                raise self._error(_KNOWN)
             return others
-        detections = decode(self._form, outputs, count, self.size, self.threshold)
+        self._form, detections = decode(self._form, outputs, count, self.size, self.threshold)
         for instances in detections:
             # Boxes may end nowhere.
             labels = instances.labels
@@ -288,6 +316,11 @@ def _session(path: str) -> Any:
     try:
         return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:
+        with open(path, "rb") as file:
+            head = file.read(1024)
+        for kind, mark in _OTHERS.items():
+            if re.match(mark, head, re.IGNORECASE | re.DOTALL):
+                raise ValueError(f"{path} is {kind}") from error
         raise ValueError(f"onnxruntime cannot read {path}: {_line(error)}") from error
 
 
@@ -296,5 +329,12 @@ def _text(shape: Sequence[int | str | None]) -> str:
 
 
 def _line(error: Exception) -> str:
-    """An error of onnxruntime in one line."""
-    return " ".join(str(error).split())[:300]
+    """An error of onnxruntime in one line: its reason, without the place in its code."""
+    text = " ".join(str(error).split())
+    if newer := re.search(r"IR version: (\d+), max supported IR version: (\d+)", text):
+        text = "it has the IR version {}, and onnxruntime reads {} at most"
+    elif newer := re.search(r"Opset (\d+) is under .* domain (\S+) is till opset (\d+)", text):
+        text = "it has the operator set {} of {}, and onnxruntime knows {} at most"
+    else:
+        return re.sub(r"\S+onnxruntime\S*\.\w+:\d+ (.*\) (?=[A-Z]))?", "", text)
+    return text.format(*newer.groups()) + ": install a newer one, or export to an older version"

@@ -1,88 +1,96 @@
-"""Which form the outputs of a detector have: by metadata, names, shapes and types."""
+"""Which form the outputs of a detector have: by names, shapes, types, ranges and metadata."""
 
 import ast
+import math
 import re
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from darswin.frames.forms import Form, Outputs, Pixels, Size, Where, cells, grids
+from darswin.frames.forms import RGB, Form, Outputs, Pixels, Size, Where, cells, grids, orders_of
 from darswin.utils.parameters import check, naming
 
 TASKS = ("detect", "pose", "obb", "segment")  # of Ultralytics
-_PARTS = {"pose": ("points", "keypoints"), "obb": ("turn", "turned boxes")}
-SCORES = ("softmax", "sigmoid")
-_RT_DETR = "RT-DETR of Ultralytics"
-_PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
+FORMS = (
+    *TASKS, "rtdetr", "yolov5", "yolov6", "yolox", "nanodet", "rfdetr", "softmax", "sigmoid",
+    "boxes", "table", "flat", "tensorflow", "mmdeploy", "efficientdet", "ssd", "numbers",
+)  # fmt: skip
 _IMAGENET = Pixels((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 _NANODET = Pixels(_IMAGENET.mean[::-1], _IMAGENET.std[::-1], "bgr")
 _BYTES = Pixels(std=(1 / 255,), channels="bgr")  # from 0 to 255
-# What makes probabilities of the scores of transformers, by the `model_type`.
-_SOFTMAX: dict[str, Any] = dict(scores="softmax", pixels=_IMAGENET)
-_SIGMOID: dict[str, Any] = dict(scores="sigmoid")
-_MODELS = dict.fromkeys(("softmax", "detr", "yolos", "table-transformer"), _SOFTMAX)
-_MODELS |= dict.fromkeys(("sigmoid", "rt_detr", "rt_detr_v2", "d_fine"), _SIGMOID)
+# What makes probabilities of the logits of transformers, and the pixels, by the `model_type`.
+_MODELS = dict.fromkeys(("detr", "yolos", "table-transformer"), ("softmax", _IMAGENET))
+_MODELS |= dict.fromkeys(("rt_detr", "rt_detr_v2", "d_fine"), ("sigmoid", RGB))
 _MODELS |= dict.fromkeys(
-    ("conditional_detr", "dab-detr", "deformable_detr", "deta"), _SIGMOID | dict(pixels=_IMAGENET)
+    ("conditional_detr", "dab-detr", "deformable_detr", "deta"), ("sigmoid", _IMAGENET)
 )
-_NAMED = {
-    "boxes scores labels -": Form("boxes, scores and labels", {}),
-    "det_boxes det_scores det_classes num_dets": Form("EfficientNMS", {}),
-    "pred_boxes pred_scores pred_classes num_predictions": Form("SuperGradients", {}),
-    "detection_boxes detection_scores detection_classes num_detections": Form(
-        "TensorFlow's detection API", {}, "rows", in_parts=True
-    ),
-}
+# The words in the names of outputs.
+_BOX, _SCORE, _LABEL = ("box", "det"), ("score", "conf", "prob", "logit"), ("label", "class", "cls")
+_POINT, _COUNT = ("keypoint", "kpt"), ("num", "valid_det", "count")
+_PART = 1.5  # boxes in parts of the picture end there, if they are not cut at its border
+_MOST = 1000  # boxes, of which none shows a thing that another one shows
+# How sure a form is: by all that is there, one of several that fit, or only if it is asked for.
+SURE, PERHAPS, ASKED = 2, 1, 0
+Candidates = Iterator[tuple[int, Form]]
 
 
-def form_of(
-    outputs: Outputs, size: Size, metadata: Mapping[str, Any],
-    task: str | None = None, scores: str | None = None,
-) -> Form | None:  # fmt: skip
-    """The form of the outputs (B, …) for black pictures of (H, W); None if it is no detector's.
+@dataclass(frozen=True)
+class Network:
+    """What is known of a network.
+
+    Attributes:
+        outputs: (B, …) of black pictures. size: (H, W) of these.
+        metadata: of the file, and of the config.json of transformers.
+        classes: how many have names, with all before the last one; 0 if it is not known.
+        batched: the outputs whose first axis counts the pictures, as the graph says.
+    """
+
+    outputs: Outputs
+    size: Size
+    metadata: Mapping[str, Any]
+    classes: int
+    batched: Collection[str]
+
+    @property
+    def task(self) -> str | None:
+        """That of Ultralytics."""
+        return task if (task := self.metadata.get("task")) in TASKS else None
+
+
+def form_of(network: Network, word: str | None = None) -> Form | None:
+    """The form of the outputs of a network, or None if it is no detector.
 
     Args:
-        metadata: of the file, and of the config.json of transformers.
-        task, scores: what the user says of outputs that do not tell it.
+        word: one of `FORMS`, which the user says.
 
     Raises:
-        ValueError: the outputs may have several forms.
+        ValueError: the outputs may have several forms, or not the one that the user says.
     """
-    own = metadata.get("task") if metadata.get("task") in TASKS else task
-    check("task", task, task in (None, own), str(own))
-    outputs = {name: values for name, values in outputs.items() if values.ndim < 5}  # no raw heads
-    form = _named(outputs) or _typed(outputs) or _pair(outputs, size)
-    form = form or _table(outputs, size, own or "", metadata)
-    part, found = _PARTS.get(str(task), ("boxes", "boxes"))
-    if form is not None and part not in form.where:
-        text = f"`task` is {task}, but the form {form.name!r} has no {found}"
-        raise naming(ValueError(text), "task")
-    if form is not None and form.scores == "?":
-        kind = _MODELS.get(scores or str(metadata.get("model_type")))
-        if kind is None:
-            of = "the scores are logits, of softmax (DETR, YOLOS) or of sigmoid (RT-DETR, D-FINE)"
-            raise _question("scores", of, "put the model's config.json beside the file")
-        return replace(form, **kind)
-    if scores is not None:
-        text = "`scores` is for the logits of transformers, so leave it out"
-        raise naming(ValueError(text), "scores")
-    if form is not None and form.overlaps:
-        _check_scores(form, outputs)
-    return form
+    fitting = [] if word == "numbers" else [*_separate(network), *_tables(network)]
+    best = max((how for how, _ in fitting), default=ASKED)
+    forms = [form for how, form in fitting if word or how == best > ASKED]
+    words = [*dict.fromkeys(form.name for form in forms)]
+    if not words or all(values.ndim < 3 for values in network.outputs.values()):
+        words.append("numbers")
+    if word in FORMS[:-1]:
+        check("form", word, word in words, f"one that its outputs may have, {' or '.join(words)}")
+        forms = [form for form in forms if form.name == word]
+    elif best == PERHAPS:
+        text = f"their form may be {' or '.join(words)}: say which by `form`, or keep what tells "
+        text += "it: the metadata of `yolo export`, or transformers' config.json beside the file"
+        raise naming(ValueError(text), "form")
+    for form in forms[:1]:
+        count = network.outputs[form.where["boxes"][0]].shape[-1 if form.things_last else -2]
+        is_raw = not form.scores and (count in grids(network.size) or count > _MOST)
+        return replace(form, overlaps=is_raw and "count" not in form.where)
+    return None
 
 
-def _check_scores(form: Form, outputs: Outputs) -> None:
-    """ValueError for scores that are no probabilities, of a form whose scores are some."""
-    for name, columns in (form.where[key] for key in ("scores", "objectness") if key in form.where):
-        values = outputs[name].swapaxes(1, 2) if form.things_last else outputs[name]
-        low, high = values[..., columns].min(), values[..., columns].max()
-        if low < -0.01 or high > 1.01:
-            raise ValueError(
-                f"its shape is that of {form.name}, but its scores must be from 0 to 1, got "
-                f"{low:.3g} to {high:.3g}: export it with its sigmoid"
-            )
+def unused(form: Form, outputs: Collection[str]) -> list[str]:
+    """The outputs that the form does not read."""
+    return [name for name in outputs if name not in {of for of, _ in form.where.values()}]
 
 
 def names_of(metadata: Mapping[str, Any]) -> dict[int, str]:
@@ -102,10 +110,6 @@ def imgsz_of(metadata: Mapping[str, Any]) -> tuple[int, int] | None:
     return (int(found[1]), int(found[2])) if found else None
 
 
-def _question(word: str, found: str, instead: str) -> ValueError:
-    return naming(ValueError(f"{found}: say which by `{word}`, or {instead}"), word)
-
-
 def _whole(**names: str | None) -> Where:
     return {key: (name, slice(None)) for key, name in names.items() if name}
 
@@ -117,155 +121,201 @@ def _columns(output: str, **widths: int) -> Where:
     return {key: (output, slice(start, end)) for key, start, end in parts if start < end}
 
 
-def _named(outputs: Outputs) -> Form | None:
-    low = {name.split(":")[0].lower(): name for name in outputs}
-    if "detections" in low and outputs[low["detections"]].shape[2:] == (7,):
-        where = _columns(low["detections"], number=1, boxes=4, scores=1, labels=1)
-        return Form("EfficientDet", where, "rows")
-    for words, form in _NAMED.items():
-        boxes, scores, labels, count = map(low.get, words.split())
-        if boxes and scores and labels:
-            same = {4 * outputs[scores].size, 4 * outputs[labels].size} == {outputs[boxes].size}
-            more = dict(count=count, masks=low.get("masks"), points=low.get("keypoints"))
-            where = _whole(boxes=boxes, scores=scores, labels=labels, **more)
-            return replace(form, where=where) if same and outputs[boxes].shape[-1] == 4 else None
-    return None
+def _says(name: str, *words: str) -> bool:
+    """Whether an output has one of these words in its name."""
+    return any(word in name.lower() for word in words)
 
 
-def _typed(outputs: Outputs) -> Form | None:
-    """Boxes (…, N, 4), scores (…, N) and integer labels (…, N), as torchvision gives them."""
-    for boxes, values in outputs.items():
-        *of, last = values.shape or (0,)
-        same = [name for name, other in outputs.items() if other.shape == (*of,)]
-        labels = [name for name in same if outputs[name].dtype.kind in "iu"]
-        if last != 4 or len(of) not in (1, 2) or len(same) != 2 or len(labels) != 1:
+def _one(names: Collection[str], *words: str) -> str | None:
+    """The only output that has one of these words in its name; or the only one, if none has."""
+    named = [name for name in names if _says(name, *words)] or [*names]
+    return named[0] if len(named) == 1 else None
+
+
+def _are_corners(boxes: np.ndarray) -> bool:
+    return not boxes.size or bool((boxes[..., :2] <= boxes[..., 2:4]).all(-1).mean() > 0.9)
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    return not (values % 1).any()
+
+
+def _separate(network: Network) -> Candidates:
+    """Boxes (B, N, 4), scores (B, N) or (B, N, C), and labels (B, N); or the same without B."""
+    outputs = network.outputs
+    for boxes in sorted(outputs, key=lambda name: not _says(name, *_BOX)):
+        *of, width = outputs[boxes].shape or (0,)
+        if width not in (4, 5) or len(of) not in (1, 2) or _says(boxes, *_SCORE):
             continue
-        where = _whole(boxes=boxes, labels=labels[0], scores=({*same} - {*labels}).pop())
-        for name, other in outputs.items():
-            if other.dtype.kind in "iu" and other.shape in ((*of[:-1],), (*of[:-1], 1)):
-                where |= _whole(count=name)
-            elif other.shape[:-2] == (*of,) and other.shape[-1] == 3:
-                where |= _whole(points=name)
-            elif other.shape[:2] == (*of, 1)[:2] and other.ndim == 4:
-                where |= _whole(masks=name)
-        return Form("torchvision" if len(of) == 1 else "boxes, scores and labels", where)
-    return None
+        more = _beside(network, of, boxes)
+        rest = [
+            name for name in outputs if name not in {boxes, *(read for read, _ in more.values())}
+        ]
+        flat = [name for name in rest if outputs[name].shape in ((*of,), (*of, 1))]
+        whole = [name for name in flat if outputs[name].dtype.kind in "iu"]
+        named = [name for name in flat if _says(name, *_LABEL) and not _says(name, *_SCORE)]
+        labels = _one(named or whole)
+        scores = _one([name for name in flat if name not in (labels, *whole)], *_SCORE)
+        where = _whole(boxes=boxes, scores=scores, labels=labels) | more
+        wide = [name for name in rest if outputs[name].shape[:-1] == (*of,)]
+        if width == 5:
+            if len(of) == 2 and (flat or "points" in more) and flat in ([], [labels]):
+                where = _columns(boxes, boxes=4, scores=1) | _whole(labels=labels) | more
+                yield SURE, Form("mmdeploy", where)
+        elif labels and scores:
+            is_sure = len(of) == 2 or boxes not in network.batched or _says(boxes, *_BOX)
+            if boxes.lower().split(":")[0] == "detection_boxes":
+                yield SURE, Form("tensorflow", where, "rows")
+            elif is_sure or _are_corners(outputs[boxes]):
+                yield SURE if is_sure else PERHAPS, Form("boxes", where)
+        elif len(of) == 2 and (scores := _one(wide, *_SCORE, *_LABEL)):
+            yield from _by_class(network, boxes, scores, more)
 
 
-def _pair(outputs: Outputs, size: Size) -> Form | None:
-    """Boxes (B, N, 4) and scores (B, N, C), or boxes with scores (B, N, 5) and labels (B, N)."""
-    if {"logits", "pred_boxes"} <= outputs.keys():  # and what the network has inside
-        names = ("logits", "pred_boxes", "pred_masks")
-        outputs = {name: outputs[name] for name in names if name in outputs}
-    masks = next((name for name, values in outputs.items() if values.ndim == 4), None)
-    flat = {name: values.shape for name, values in outputs.items() if name != masks}
-    tables = [name for name, shape in flat.items() if shape[2:] in ((4,), (5,))]
-    tables = [name for name in tables if name in ("dets", "pred_boxes")] or tables
-    if len(flat) != 2 or len(tables) != 1:
-        return None
-    (boxes,), (other,) = tables, flat.keys() - {*tables}
-    where, (*things, width) = _whole(boxes=boxes, scores=other, masks=masks), flat[boxes]
-    if width == 5 and flat[other] == (*things,):
-        where = _columns(boxes, boxes=4, scores=1) | _whole(labels=other, masks=masks)
-        return Form("MMDeploy", where)
-    if width == 5 or flat[other][:-1] != (*things,):
-        return None
-    if things[1] in grids(size):
-        corners, scores = outputs[boxes], outputs[other]
-        share = (corners[..., :2] <= corners[..., 2:]).all(-1).mean()
-        are_read = share > 0.9 and scores.min() >= 0 and scores.max() <= 1
-        return Form("YOLO-NAS", where, overlaps=True) if are_read else None
-    if boxes == "dets":
-        return Form("RF-DETR", where, "middle", True, "sigmoid", pixels=_IMAGENET)
-    return Form("transformers", where, "middle", True, "?")
+def _by_class(network: Network, boxes: str, scores: str, more: Where) -> Candidates:
+    """Boxes (B, N, 4) and scores of each class (B, N, C)."""
+    where, values = _whole(boxes=boxes, scores=scores) | more, network.outputs[scores]
+    is_named = boxes in ("dets", "pred_boxes")
+    if not is_named and values.min(initial=0) >= 0 and values.max(initial=0) <= 1:
+        if _are_corners(network.outputs[boxes]):
+            yield SURE, Form("boxes", where)
+    elif is_named or values.shape[1] not in grids(network.size):
+        # A column more than there are classes is for nothing.
+        is_more = values.shape[2] == network.classes + 1 > 1
+        known = where | {"scores": (scores, slice(0, network.classes))} if is_more else where
+        middle: dict[str, Any] = dict(code="middle", in_parts=True)
+        if boxes != "pred_boxes":
+            form = Form("rfdetr", known, scores="sigmoid", pixels=_IMAGENET, **middle)
+            yield SURE if is_named else PERHAPS, form
+        kind, pixels = _MODELS.get(str(network.metadata.get("model_type")), (None, RGB))
+        usual = ASKED if boxes == "dets" else PERHAPS
+        form = Form("softmax", where, scores="softmax", pixels=_IMAGENET, **middle)
+        yield SURE if kind == "softmax" else usual, form
+        form = Form("sigmoid", known, scores="sigmoid", pixels=pixels, **middle)
+        yield SURE if kind == "sigmoid" else usual, form
 
 
-def _table(outputs: Outputs, size: Size, task: str, metadata: Mapping[str, Any]) -> Form | None:
-    """One table, and perhaps the masks that all things share."""
-    quarter = 32, size[0] // 4, size[1] // 4
-    protos = [name for name, values in outputs.items() if values.shape[1:] == quarter]
-    tables = [name for name in outputs if name not in protos]
-    if len(tables) != 1 or len(protos) > 1:
-        return None
-    name, values, shape = tables[0], outputs[tables[0]], outputs[tables[0]].shape
+def _beside(network: Network, of: Sequence[int], boxes: str) -> Where:
+    """Masks, keypoints and the number of things beside boxes (…, N, 4); `of` is (…, N)."""
+    (height, width), parts = network.size, dict[str, str]()
+    for name, values in network.outputs.items():
+        rest, same = values.shape[len(of) :], values.shape[: len(of)] == (*of,)
+        if _says(name, *_COUNT) or (values.dtype.kind in "iu" and not same):
+            if values.size == math.prod(of[:-1]):
+                parts["count"] = name
+        elif not same or name == boxes:
+            continue
+        elif len(rest) == 1 and _says(name, *_POINT) and _says(name, *_SCORE):
+            parts["point_scores"] = name
+        elif len(rest) == 2 and rest[1] in (2, 3):
+            parts["points"] = name
+        elif len(rest) in (2, 3) and rest[-3:-2] in ((), (1,)):
+            is_square = rest[-2] in (rest[-1], rest[-1] * height / width)
+            parts |= {"masks": name} if is_square or _says(name, "mask") else {}
+    if "points" not in parts or network.outputs[parts["points"]].shape[-1] != 2:
+        parts.pop("point_scores", None)
+    return _whole(**parts)
+
+
+def _tables(network: Network) -> Candidates:
+    """One table, and perhaps the masks (B, M, H/4, W/4) that all things share."""
+    outputs, quarter = network.outputs, (network.size[0] // 4, network.size[1] // 4)
+    count = _one([name for name in outputs if _says(name, *_COUNT) and outputs[name].ndim < 3])
+    protos = _one([name for name, values in outputs.items() if values.shape[2:] == quarter])
+    name = _one(
+        [name for name in outputs if outputs[name].ndim < 5 and name not in (count, protos)]
+    )
+    for shared in dict.fromkeys((protos, None)) if name else ():  # or it is another map
+        yield from _table(network, str(name), shared, _whole(protos=shared, count=count))
+
+
+def _table(network: Network, name: str, protos: str | None, more: Where) -> Candidates:
+    outputs, size = network.outputs, network.size
+    values, shape = outputs[name], outputs[name].shape
     if shape[:2] == (1, 1) and shape[3:] == (7,) and size[0] * 7 != size[1] * shape[2]:
-        return Form("SSD", _columns(name, image=1, labels=1, scores=1, boxes=4), in_parts=True)
-    if shape[1:] == (7,) and not (values[:, 0] % 1).any() and _has_whole(values[:, 5:]):
-        where = _columns(name, image=1, boxes=4, labels=1, scores=1)
-        return Form("YOLOv7 or YOLO-NAS with NMS", where)
-    if len(shape) != 3:
-        return None
-    (_, count, width), known, masks = shape, grids(size), 32 * len(protos)
-    strides, each = known.get(count, ((), 0))
-    last = count > 4 and known.get(width, ((), 0))[1] == 1
-    shared = _whole(protos=protos[0] if protos else None)
-    parts = 0 < values[..., :4].max(initial=0) < _PART
-    if last or ((task or protos) and not each):
-        task = task or "segment" * len(protos)
-        form = _ultralytics(name, count if last else width, last, task, metadata, shared)
-        is_decoder = metadata.get("head") == "RTDETRDecoder" or ("head" not in metadata and parts)
-        if form and width == 6 and is_decoder:
-            return replace(form, name=_RT_DETR, code="middle", in_parts=True)
-        return form
-    where = _columns(name, boxes=4, objectness=1, scores=width - 5 - masks, weights=masks) | shared
-    if each and width > 5 + masks:
+        yield SURE, Form("ssd", _columns(name, image=1, labels=1, scores=1, boxes=4))
+    is_flat = shape[1:] == (7,) and _are_whole(values[:, 0]) and _are_corners(values[:, 1:])
+    if is_flat and orders_of(values[:, 5:]):
+        where = _columns(name, image=1, boxes=4, scores=1, labels=1)
+        is_sure = name not in network.batched or not len(values)
+        yield SURE if is_sure else PERHAPS, Form("flat", where | {"either": (name, slice(5, 7))})
+    if len(shape) != 3 or shape[1:] == size or values.dtype.kind != "f":  # or a map
+        return
+    masks, (_, count_of, width) = outputs[protos].shape[1] if protos else 0, shape
+    strides, each = grids(size).get(count_of, ((), 0))
+    if count_of > 4 and grids(size).get(width, ((), 0))[1] == 1:
+        yield from _ultralytics(network, name, count_of, True, masks, more)
+    elif not each or (width == 6 and _has_class(values)):
+        yield from _final(network, name, masks, more)
+    elif width > 5 + masks:
+        where = _columns(name, boxes=4, objectness=1, scores=width - 5 - masks, weights=masks)
+        where |= more
+        x, _, side = cells(size, strides).T
         if each == 3:
-            return Form("YOLOv5 or YOLOv7", where, "middle", overlaps=True)
-        if (values[..., 4] == 1).all():
-            return Form("YOLOv6", where, "middle", overlaps=True)
-        if len(strides) == 4 and width > 32:
+            yield SURE, Form("yolov5", where, "middle")
+        elif (values[..., 4] == 1).all():
+            yield SURE, Form("yolov6", where, "middle")
+        elif len(strides) == 4 and width > 32:
             where = _columns(name, scores=width - 32, boxes=32)
-            return Form("NanoDet-Plus", where, "nanodet", overlaps=True, pixels=_NANODET)
-        x, _, side = cells(size, strides).T  # a decoded x is near that of its cell
-        code = "middle" if np.corrcoef(values[0, :, 0], x * side)[0, 1] > 0.7 else "yolox"
-        return Form("YOLOX", where, code, overlaps=True, pixels=_BYTES)
-    if width == 6 and parts:
-        found = "the boxes are parts of the picture, perhaps as of Ultralytics' RT-DETR (detect)"
-        raise _question("task", found, "export corners in pixels")
-    if width == 6:
-        return Form("boxes, score and class", _columns(name, boxes=4, scores=1, labels=1))
-    if width in (7, 57):
-        kind = "turned boxes (obb)" if width == 7 else "keypoints (pose)"
-        found = f"they may be {kind} of Ultralytics, or something else"
-        raise _question("task", found, "keep the metadata that `yolo export` writes")
-    return None
+            yield SURE, Form("nanodet", where, "nanodet", False, pixels=_NANODET)
+        elif np.corrcoef(values[0, :, 0], x * side)[0, 1] > 0.7:  # x is near that of its cell
+            yield SURE, Form("yolox", where, "middle", pixels=_BYTES)
+        else:
+            yield SURE, Form("yolox", where, "yolox", False, pixels=_BYTES)
 
 
-def _has_whole(columns: np.ndarray) -> bool:
-    return bool((columns % 1 == 0).all(0).any())
+def _has_class(values: np.ndarray) -> bool:
+    """Whether the last of 6 columns is a class, not a probability, which 16 bits make 1."""
+    label = values[..., 5]
+    return _are_whole(label) and (not label.any() or _are_corners(values))
+
+
+def _final(network: Network, name: str, masks: int, more: Where) -> Candidates:
+    """Rows (B, N, …) of which each is one thing, or all cells."""
+    values, task, head = network.outputs[name], network.task, network.metadata.get("head")
+    width = values.shape[2]
+    in_parts = 0 < values[..., :4].max(initial=0) <= _PART and values.min(initial=0) > -_PART
+    has_class = width == 6 and _are_whole(values[..., 5])
+    is_rtdetr = in_parts if head is None else head == "RTDETRDecoder"
+    for how, form in _ultralytics(network, name, width, False, masks, more):
+        yield ASKED if form.name == "detect" and is_rtdetr else how, form
+    if width > 4 and not masks and task in (None, "detect"):
+        columns = dict(scores=1, labels=1) if has_class else dict(scores=width - 4)
+        fits = has_class or width - 4 == network.classes
+        is_sure = task and fits and (is_rtdetr or width != 6)
+        how = SURE if is_sure else PERHAPS if in_parts and task is None else ASKED
+        yield how, Form("rtdetr", _columns(name, boxes=4, **columns) | more, "middle", True)
+    if width == 6 and not masks:
+        where = _columns(name, boxes=4, scores=1, labels=1) | more
+        yield PERHAPS if in_parts else SURE, Form("table", where)
+    if width == 7 and not masks:
+        where = _columns(name, number=1, boxes=4, scores=1, labels=1) | more
+        yield SURE if _says(name, "detections") else PERHAPS, Form("efficientdet", where, "rows")
 
 
 def _ultralytics(
-    name: str, total: int, last: bool, task: str, metadata: Mapping[str, Any], shared: Where
-) -> Form | None:
-    """The columns of a task, by the names of classes; without these, a pose has one class."""
-    classes = len(names_of(metadata))
-    if not task:
-        rest = total - 4 - classes if classes else 0 if total == 5 else -1
-        if rest not in (0, 1):
-            found = (
-                f"they may be boxes of {total - 4} classes (detect), "
-                f"turned boxes of {total - 5} (obb), or keypoints (pose)"
-            )
-            raise _question("task", found, "export it by `yolo export`, which writes metadata")
-        task = ("detect", "obb")[rest]
-    if last:
-        one = {"detect": total - 4, "obb": total - 5, "segment": total - 36, "pose": 1}[task]
-        columns = dict(boxes=4, scores=classes or one)
-    else:
-        columns = dict(boxes=4, scores=1, labels=1)
-    rest = total - sum(columns.values())
-    if task == "detect" and not last and classes > 2 and rest == classes - 2:
-        where = _columns(name, boxes=4, scores=classes)
-        return Form(_RT_DETR, where, "middle", in_parts=True)
-    point = 2 if rest % 3 else 3
-    if "kpt_shape" in metadata:
-        point = ast.literal_eval(str(metadata["kpt_shape"]))[1]
-    more: dict[str, int] = {"obb": {"turn": 1}, "segment": {"weights": 32}}.get(task, {})
-    if task == "pose" and rest % point == 0:
-        more = {"points": rest}
-    if sum(more.values()) != rest or min(columns.values()) < 1:
-        return None
-    where = _columns(name, **columns, **more) | shared
-    code = "middle" if last or task == "obb" else "corners"
-    return Form(f"Ultralytics {task}", where, code, things_last=last, overlaps=last, point=point)
+    network: Network, name: str, total: int, last: bool, masks: int, more: Where
+) -> Candidates:
+    """Each task whose columns these may be, by the number of classes if it is known."""
+    own, shape = network.task, ast.literal_eval(str(network.metadata.get("kpt_shape")))
+    for classes in (network.classes, 0):
+        forms = []
+        for task in (own,) if own else TASKS:
+            beside = {"obb": 1, "segment": masks}.get(task, 0)
+            scores = (classes or (1 if task == "pose" else total - 4 - beside)) if last else 1
+            columns = dict(boxes=4, scores=scores) | ({} if last else dict(labels=1))
+            rest = total - sum(columns.values())
+            point = shape[1] if shape else 2 if rest % 3 else 3
+            if task == "pose":
+                beside = rest if rest > 0 and rest % point == 0 else -1
+            if scores > 0 and rest == beside and (task == "segment") == (masks > 0):
+                key = {"pose": "points", "obb": "turn", "segment": "weights"}.get(task)
+                where = _columns(name, **columns, **({key: rest} if key else {})) | more
+                code = "middle" if last or task == "obb" else "corners"
+                forms.append(Form(task, where, code, things_last=last, point=point))
+        if forms:
+            break
+    is_usual = last or masks or total in (7, 57)  # or else they ask for any table
+    has_weights = masks and (network.outputs[name] < 0).any()  # as no probabilities are
+    is_sure = own or (len(forms) == 1 and (has_weights if masks else last))
+    yield from ((SURE if is_sure else PERHAPS if is_usual else ASKED, form) for form in forms)

@@ -19,17 +19,19 @@ def find_detections(results: Any) -> list[Mapping[str, Tensor]] | None:
     """The detections for each picture if a network's results are some, or None.
 
     They are a dict of boxes, scores and labels with a batch axis, or a list of dicts without it, as
-    torchvision returns them.
+    torchvision returns them. Of a dict with `num_dets` or `num_detections`, only so many rows.
     """
     if isinstance(results, Mapping) and _has_boxes(results):
         if results["boxes"].dim() == 2:
             return [results]
         pictures = len(results["boxes"])
+        counts = [results[name] for name in ("num_dets", "num_detections") if name in results]
+        stops = counts[0].reshape(-1).tolist() if counts else [None] * pictures
         values = {
             name: value for name, value in results.items()
             if isinstance(value, Tensor) and value.dim() > 1 and len(value) == pictures
         }  # fmt: skip
-        return [{name: value[k] for name, value in values.items()} for k in range(pictures)]
+        return [{name: v[k][: stops[k]] for name, v in values.items()} for k in range(pictures)]
     is_list = isinstance(results, (list, tuple)) and len(results) > 0
     return list(results) if is_list and all(map(_has_boxes, results)) else None
 

@@ -212,7 +212,7 @@ def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(capsys):
     write("p.png", np.zeros((*SIZE, 3), np.uint8))
     lens = WIDE | {"theta_max": 1.0}  # 88 px around (163, 117)
     (entry,) = predict("p.png --network n.onnx --labels names.json --view stereographic", lens)
-    assert "n.onnx were left out: 2 without an area, and 0 within" in capsys.readouterr().err
+    assert "2 of 8 boxes of n.onnx have no area and are left out" in capsys.readouterr().err
     labels = [thing["label"] for thing in entry["detections"]]
     assert labels == ["inside", "cut", "half outside", "inside"]  # the best first
     kept = dict(zip(labels[:3], entry["detections"], strict=False))
@@ -278,9 +278,15 @@ def test_a_view_that_sees_nothing_is_told_for_each_camera(disc, view):
 
 
 def test_what_a_network_needs(disc, monkeypatch):
-    with pytest.raises(SystemExit, match=r"p\.png .* is 320×240, but the network takes 256×256: c"):
-        predict("p.png --network n.onnx --view none")
-    assert Path("out/predictions.json").read_text() == "[]"
+    for size, said in (
+        ((256, 256), "resamples it$"),
+        (("H", "W"), "or give it by --size, 240,320"),
+    ):
+        write_graph(Path("n.onnx"), size=size)
+        known = "" if size[0] == 256 else "--size 256,256"
+        with pytest.raises(SystemExit, match=rf"p\.png .* is 320×240, .* takes 256×256: .*{said}"):
+            predict(f"p.png --network n.onnx --view none {known}")
+        assert Path("out/predictions.json").read_text() == "[]"
     monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")
     with pytest.raises(SystemExit, match="onnxruntime missing"):
         predict("p.png --network n.onnx")
@@ -420,21 +426,21 @@ def test_turned_boxes_come_back(view, size):
 
 
 def test_each_picture_has_an_id_of_its_own_in_coco():
-    """Their names are no ids if two have one number; and an old file is replaced by nothing."""
+    """Their names are their ids, unless two have one number; and an old file is replaced."""
     write_constants(Path("n.onnx"), (64, 64), found=np.array([[[10, 10, 30, 30, 0.5, 1]]], F))
     for name in ("in/a/7.png", "in/b/8.png", "in/b/c.png", "more/b/07.png"):
         write(name, np.zeros((64, 80, 3), np.uint8))
     write_frames("in/v.mp4", np.zeros((2, 64, 80, 3), np.uint8), 10)
     frames = ["v.mp4/000000", "v.mp4/000001"]
-    names = [f"in/{name}" for name in ("a/7", "b/8", "b/c", *frames)]
-    for paths, threshold, ids in (
-        ("in", "0.1", [7, 8, "b/c", *frames]),
-        ("in more", "0.1", [*names, "more/b/07"]),
-        ("in", "0.9", []),
+    names = ["a/7", "b/8", "b/c", *frames]
+    for paths, threshold, expected in (
+        ("in", "0.1", dict(zip(names, [7, 8, 9, 10, 11], strict=True))),
+        ("in more", "0.1", {f"in/{name}": k for k, name in enumerate(names, 1)} | {"more/b/07": 6}),
+        ("in", "0.9", {}),
     ):
         predict(f"{paths} --network n.onnx --format coco --threshold {threshold}", SMALL)
         results = json.loads(Path("out/coco.json").read_text())
-        assert [one["image_id"] for one in results] == ids
+        assert {one["file_name"]: one["image_id"] for one in results} == expected
 
 
 def test_a_mask_of_few_pixels_is_a_box_in_yolo_and_infinity_is_null_in_json():
@@ -457,12 +463,15 @@ def test_boxes_that_overlap_are_merged_and_words_answer_questions(capsys):
     rows = np.pad(rows, ((0, 0), (0, 80)))  # the cells of 16 and 32 px
     write_detector(Path("n.onnx"), (128, 128), {"output0": rows[None].astype(F)})
     write("p.png", np.zeros((64, 80, 3), np.uint8))
-    with pytest.raises(SystemExit, match=r"2 classes \(detect\), .*: say which by --task, or"):
+    with pytest.raises(SystemExit, match=r"may be detect or obb: say which by --form, or"):
         predict("p.png --network n.onnx", SMALL)
-    (entry,) = predict("p.png --network n.onnx --task detect", SMALL)
+    (entry,) = predict("p.png --network n.onnx --form detect", SMALL)
     (thing,) = entry["detections"]
     assert (thing["label"], thing["score"]) == (1, 0.9)
-    assert "detections (Ultralytics detect); pixels are rgb" in capsys.readouterr().err
+    assert (
+        "detections (form detect, boxes that overlap are merged); pixels are rgb"
+        in capsys.readouterr().err
+    )
 
 
 def test_pixels_are_those_of_the_form_unless_they_are_given(capsys):
@@ -476,28 +485,25 @@ def test_pixels_are_those_of_the_form_unless_they_are_given(capsys):
         answers = NetworkAnswers("n.onnx", **options)
         assert (answers._mean, answers._std, answers._step) == (mean, std, step)
         said = capsys.readouterr().err
-        assert "detections (RF-DETR); pixels are" in said and f"std {std[0]:g}" in said
+        assert "detections (form rfdetr); pixels are" in said and f"std {std[0]:g}" in said
 
 
 CORNERS = np.array([[[8, 10, 30, 40], [40, 5, 60, 22], [20, 30, 50, 60]]], F)
 CENTRES = np.array([[[30, 40, 8, 10], [50, 22, 8, 9], [20, 30, 50, 60]]], F)
 
 
-@pytest.mark.parametrize(
-    ("boxes", "said"),
-    [
-        (CENTRES, r"2 of 3 boxes of .* were left out: 2 without an area, .*centres and sizes"),
-        (CORNERS / 64, r"3 within the first 2 px\. They may be parts of the picture"),
-        (CENTRES / 64, r"3 within the first 2 px\. They may be parts of the picture"),
-        (CORNERS[..., [2, 3, 0, 1]], "3 without an area"),
-    ],
-)
-def test_boxes_that_are_none_are_an_error(capsys, boxes, said):
-    outputs = dict(boxes=boxes, scores=np.full((1, 3), 0.9, F), labels=np.zeros((1, 3), np.int64))
-    with pytest.raises(SystemExit, match=said) as error:
-        of_constants(**outputs)
-    assert error.value.code != 0 and "corners x0, y0, x1, y1 in pixels" in capsys.readouterr().err
-    assert json.loads(Path("out/predictions.json").read_text())  # what was found is kept
+def test_boxes_are_pixels_or_parts_and_an_error_if_they_are_none(capsys):
+    labels = np.zeros((1, 3), np.int64)
+    outputs = dict(scores=np.full((1, 3), 0.9, F), labels=labels, more=labels * 0.5)
+    first, other = (of_constants(boxes=CORNERS / by, **outputs) for by in (1, 64))
+    assert first == other and len(first["detections"]) == 3
+    assert "outputs that are not used: more; pixels" in capsys.readouterr().err
+    for boxes, said in ((CENTRES, "2 of 3 .* centres and"), (CORNERS[..., [2, 3, 0, 1]], "3 of 3")):
+        for by in (1, 64):
+            with pytest.raises(SystemExit, match=said) as error:
+                of_constants(boxes=boxes / by, **outputs)
+            assert error.value.code != 0 and "corners x0, y0, x1, y1" in capsys.readouterr().err
+            assert json.loads(Path("out/predictions.json").read_text())  # what was found is kept
 
 
 # -- maps and numbers -------------------------------------------------------------------------

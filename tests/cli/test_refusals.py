@@ -85,8 +85,8 @@ REFUSED = {
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be finite, got nan
         n.onnx --labels gone.txt => gone.txt
-        n.onnx --task distance => --task must be one of detect, pose, obb, segment, got dis
-        maps.onnx --task pose => --task is pose, but maps.onnx is a model for maps
+        n.onnx --task distance => --task does not go with --network
+        maps.onnx --form pose => --form must be one that its outputs may have, numbers, got pose
         n.onnx --height 2 => --height needs --up, the direction away from gravity
         n.onnx --radius 1 => --radius must be given with --height, got 1.0
         n.onnx --height 2 --radius -1 --up=0,-1,0 => --radius must be at least 0 m

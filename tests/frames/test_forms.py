@@ -9,14 +9,16 @@ import math
 
 import numpy as np
 import pytest
-from helpers import slow_but
+from helpers import refused, slow_but
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from graphs import write_detector
 
+from darswin.frames.forms import decode
 from darswin.frames.onnx import OnnxNetwork
+from darswin.frames.recognise import Network, form_of
 
 pytestmark = pytest.mark.unsanitized  # nothing of it is compiled
 
@@ -72,14 +74,8 @@ def beside(*parts):
 
 
 def cell_row(width, *, first=()):
-    return lambda x, y, s: [
-        (x + 0.5) * s,
-        (y + 0.5) * s,
-        s,
-        s,
-        *first,
-        *[0.01] * (width - len(first)),
-    ]
+    rest = [*first, *[0.01] * (width - len(first))]
+    return lambda x, y, s: [(x + 0.5) * s, (y + 0.5) * s, s, s, *rest]
 
 
 def yolo(rows):
@@ -106,10 +102,8 @@ def nanodet():
     for k, distances in enumerate(near):
         at = int(np.argmin(distances))
         x, y, s = strides[at]
-        box = BOXES[k]
-        for side, length in enumerate(
-            (x * s - box[0], y * s - box[1], box[2] - x * s, box[3] - y * s)
-        ):
+        x0, y0, x1, y1 = BOXES[k]
+        for side, length in enumerate((x * s - x0, y * s - y0, x1 - x * s, y1 - y * s)):
             low, part = divmod(length / s, 1)
             share = np.full(8, 1e-9)
             share[int(low)], share[int(low) + 1] = 1 - part, max(part, 1e-9)
@@ -118,16 +112,18 @@ def nanodet():
     return cells
 
 
-def protos():
+def protos(count=32):
     """A mask for each thing, of its box and half a pixel more, and others."""
     y, x = np.mgrid[: HEIGHT // 4, : WIDTH // 4] * 4 + 2
-    masks = np.full((32, HEIGHT // 4, WIDTH // 4), -8.0)
+    masks = np.full((count, HEIGHT // 4, WIDTH // 4), -8.0)
     for k, (x0, y0, x1, y1) in enumerate(BOXES):
         masks[k][(x > x0 - 9) & (x < x1 - 5) & (y > y0) & (y < y1 + 9)] = 8
     return masks
 
 
-WEIGHTS = np.eye(K, 32)
+WEIGHTS = -np.eye(K, 64)
+UPPER = np.zeros((K, 28, 28))  # the upper half of each box
+UPPER[:, :14] = 1
 IN_PARTS, CENTRED_PARTS = BOXES / ACROSS, CENTRED / ACROSS
 
 
@@ -154,15 +150,33 @@ def row(values, *more):
 FORMS = {
     "own": (dict(boxes=full(BOXES), scores=full(SCORES), labels=full(LABELS).astype(int)), {}),
     "own, one masked": (dict(boxes=BOXES, scores=SCORES, labels=LABELS * 1.0), {}),
+    "own, by other names, in parts": (
+        dict(bboxes=full(IN_PARTS), class_idx=full(LABELS).astype(int), conf=full(SCORES)), {},
+    ),
+    "own, of all cells": (
+        dict(boxes=full(BOXES, 735), scores=full(SCORES, 735),
+             class_ids=full(LABELS, 735).astype(int)), {},
+    ),
+    "own, counted, with keypoints": (
+        dict(num_dets=np.array([K]), boxes=full(BOXES), scores=np.r_[SCORES, np.full(288, 0.99)],
+             labels=full(LABELS).astype(int), keypoints=full(POINTS)), {},
+    ),
     "table": (dict(out=full(ROWS)), {}),
+    "table beside a map": (dict(out=full(ROWS), features=np.zeros((8, 40, 56))), {}),
+    "table in parts": (dict(out=full(beside(IN_PARTS, SCORES, LABELS))), dict(form="table")),
+    "table of all cells": (dict(out=full(ROWS, 735)), {}),
     "detect": (dict(output0=yolo(beside(CENTRED, one_hot(80)))), of("detect")),
     "detect without task": (
         dict(output0=yolo(beside(CENTRED, one_hot(80)))),
         dict(metadata={"names": [*NAMES.values()]}),
     ),
-    "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(told="detect")),
+    "detect beside a map": (
+        dict(output0=yolo(beside(CENTRED, one_hot(80))), features=np.zeros((8, 40, 56))),
+        of("detect"),
+    ),
+    "detect of 51": (dict(output0=yolo(beside(CENTRED, one_hot(51)))), dict(form="detect")),
     "segment": (
-        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=protos()),
+        dict(output0=yolo(beside(CENTRED, one_hot(80), WEIGHTS)), output1=-protos(64)),
         of("segment"),
     ),
     "pose": (dict(output0=yolo(beside(CENTRED, SCORES, POINTS))), dict(metadata=POSE)),
@@ -173,15 +187,12 @@ FORMS = {
     "obb": (dict(output0=yolo(beside(CENTRED, one_hot(80), ANGLES))), of("obb")),
     "detect, end to end": (dict(output0=full(ROWS)), of("detect")),
     "segment, end to end": (
-        dict(output0=full(beside(ROWS, WEIGHTS)), output1=protos()),
-        of("segment"),
+        dict(output0=full(beside(ROWS, WEIGHTS[:, :16])), output1=-protos(16)), of("segment"),
     ),
     "pose, end to end": (
         dict(output0=full(beside(BOXES, SCORES, 0 * X, POINTS))), dict(metadata=POSE),
     ),
-    "obb, end to end": (
-        dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb"),
-    ),
+    "obb, end to end": (dict(output0=full(beside(CENTRED, SCORES, LABELS, ANGLES))), of("obb")),
     "RT-DETR of Ultralytics": (
         dict(output0=full(beside(CENTRED_PARTS, one_hot(80)))), of("detect"),
     ),
@@ -191,6 +202,14 @@ FORMS = {
     ),
     "RT-DETR of Ultralytics, older": (
         dict(output0=full(beside(CENTRED_PARTS, SCORES, LABELS))), of("detect"),
+    ),
+    "RT-DETR of Ultralytics, 2 classes": (
+        dict(output0=beside(CENTRED_PARTS, one_hot(2, labels=LABELS % 2))),
+        dict(metadata=ULTRA | {"task": "detect", "names": ["a", "b"]}),
+    ),
+    "RT-DETR of Ultralytics, one class": (
+        dict(output0=beside(CENTRED_PARTS, SCORES)),
+        dict(metadata=ULTRA | {"task": "detect", "names": ["a"]}),
     ),
     "YOLOv5": (
         dict(output=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98)),
@@ -202,12 +221,13 @@ FORMS = {
                           cell_row(81, first=(0.01,)), (8, 16, 32, 64), 3)), {},
     ),
     "YOLOv5 of one class": (
-        dict(output=dense(beside(CENTRED, np.full(K, 0.98), SCORES / 0.98),
-                          cell_row(2, first=(0.01,)), each=3)), {},
+        dict(output=dense(beside(CENTRED, SCORES, np.ones(K)),  # as 16 bits round it
+                          cell_row(2, first=(0.01, 1)), each=3)), {},
     ),
     "YOLOv5 segment": (
-        dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98), WEIGHTS),
-                           cell_row(113, first=(0.01,)), each=3), output1=protos()), {},
+        dict(output0=dense(beside(CENTRED, np.full(K, 0.98), one_hot(80, SCORES / 0.98),
+                                  WEIGHTS[:, :32]),
+                           cell_row(113, first=(0.01,)), each=3), output1=-protos()), {},
     ),
     "YOLOv6": (
         dict(outputs=dense(beside(CENTRED, np.ones(K), one_hot(80)), cell_row(81, first=(1,)))), {},
@@ -222,26 +242,32 @@ FORMS = {
     "RF-DETR segment": (
         dict(dets=CENTRED_PARTS, labels=logit(one_hot(91)), masks=protos()[:K]), {},
     ),
-    "RT-DETR": (
-        dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes"),
+    "RF-DETR with a column for nothing, and keypoints": (
+        dict(dets=CENTRED_PARTS, labels=np.hstack((logit(one_hot(80)), np.full((K, 1), 9.0))),
+             keypoints=np.concatenate((POINTS[..., :2] / SIZE[::-1], POINTS[..., 2:]), 2)),
+        dict(metadata={"names": NAMES}),
     ),
+    "RT-DETR": (dict(labels=LABELS, boxes=IN_PARTS, scores=SCORES), dict(sized="boxes")),
     "DETR": (dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS), dict(model_type="detr", masked=True)),
     "DETR, told": (
         dict(logits=SOFTMAX_, pred_boxes=CENTRED_PARTS, last_hidden_state=np.zeros((K, 256))),
-        dict(scores="softmax"),
+        dict(form="softmax"),
     ),
     "D-FINE of transformers": (
         dict(logits=logit(one_hot(80)), pred_boxes=CENTRED_PARTS), dict(model_type="d_fine"),
     ),
-    "TensorFlow": (
+    "TensorFlow with masks of boxes, and keypoints": (
         {"detection_boxes:0": IN_PARTS[:, YX], "detection_scores:0": SCORES,
-         "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0)}, {},
+         "detection_classes:0": LABELS * 1.0, "num_detections:0": np.array(K * 1.0),
+         "detection_masks": UPPER, "detection_keypoint_scores": POINTS[..., 2],
+         "detection_keypoints": POINTS[..., 1::-1] / SIZE, "raw_detection_boxes": IN_PARTS}, {},
     ),
     "EfficientDet": (dict(detections=row(BOXES[:, YX], SCORES, LABELS)), {}),
     "MMDeploy": (dict(dets=beside(BOXES, SCORES), labels=LABELS), {}),
-    "MMDeploy segment": (
-        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=np.zeros((K, 28, 28))), {},
+    "MMDeploy with masks of boxes": (
+        dict(dets=beside(BOXES, SCORES), labels=LABELS, masks=UPPER), {},
     ),
+    "MMPose with keypoints, one class": (dict(dets=beside(BOXES, SCORES), keypoints=POINTS), {}),
     "EfficientNMS": (
         dict(num_dets=np.array([K]), det_boxes=full(BOXES, 100),
              det_scores=full(SCORES, 100) - (np.arange(100) >= K),
@@ -272,10 +298,13 @@ FLAT = {
 }  # fmt: skip
 # What is only known by names, metadata or a word, so that it is asked for without them.
 ASKED = {
-    "own, one masked", "detect", "detect without task", "detect of 51", "pose", "pose of 2", "obb",
-    "pose, end to end", "obb, end to end", "RT-DETR of Ultralytics",
-    "RT-DETR of Ultralytics, the best", "RT-DETR of Ultralytics, older", "RF-DETR",
-    "RF-DETR segment", "DETR", "DETR, told", "D-FINE of transformers", "TensorFlow", "EfficientDet",
+    "own, one masked", "table in parts", "detect", "detect beside a map", "detect without task",
+    "detect of 51", "pose", "pose of 2", "obb", "pose, end to end", "obb, end to end",
+    "RT-DETR of Ultralytics", "RT-DETR of Ultralytics, 2 classes",
+    "RT-DETR of Ultralytics, one class", "RT-DETR of Ultralytics, the best",
+    "RT-DETR of Ultralytics, older", "RF-DETR", "RF-DETR segment",
+    "RF-DETR with a column for nothing, and keypoints", "DETR", "DETR, told", "EfficientDet",
+    "D-FINE of transformers", "TensorFlow with masks of boxes, and keypoints",
 }  # fmt: skip
 ALL = FORMS | FLAT
 
@@ -284,12 +313,12 @@ def written(folder, form, dtype=np.float32, batch=1, renamed=False):
     """The network of a form, and the words that it needs."""
     outputs, how = ALL[form]
     how = dict(how)
-    words = {"task": how.pop("told", None), "scores": how.pop("scores", None)}
+    words = {"form": how.pop("form", None)}
     if "model_type" in how:
         config = dict(model_type=how.pop("model_type"), id2label=NAMES)
         (folder / "config.json").write_text(json.dumps(config))
     if renamed:
-        names = dict(zip(outputs, "abcdef", strict=False))
+        names = dict(zip(outputs, "abcdefgh", strict=False))
         outputs = {names[name]: value for name, value in outputs.items()}
         how["sized"] = names.get(how.get("sized"))
         how.pop("metadata", None)
@@ -306,7 +335,8 @@ def written(folder, form, dtype=np.float32, batch=1, renamed=False):
 def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
     order = np.argsort(-found.scores)
     turned = "obb" in form
-    labels = 0 * LABELS if "pose" in form or "one class" in form else LABELS
+    labels = LABELS % 2 if "2 classes" in form else LABELS
+    labels = 0 * LABELS if "pose" in form or "one class" in form else labels
     expected = np.concatenate((CENTRED, ANGLES), 1) if turned else BOXES
     np.testing.assert_allclose(found.boxes[order], expected, atol=px)
     np.testing.assert_allclose(found.scores[order], SCORES, atol=in_scores)
@@ -316,9 +346,13 @@ def check_known(form, found, *, px=1e-3, in_scores=1e-4, within=2e-3):
         numbers = found.keypoints.shape[2]
         assert numbers == (2 if form == "pose of 2" else 3)
         np.testing.assert_allclose(found.keypoints[order], POINTS[..., :numbers], atol=px)
-    shows = ("segment" in form or "masks" in form) and "MMDeploy" not in form
-    assert (found.masks is None) != shows
-    if shows:
+    assert (found.masks is None) != ("segment" in form or "masks" in form)
+    if "masks of boxes" in form:
+        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        for mask, (x0, y0, x1, y1) in zip(found.masks[order], BOXES, strict=True):
+            upper = (x > x0) & (x < x1) & (y > y0) & (y < (y0 + y1) / 2)
+            assert ((mask > 0.5) != upper).sum() < 0.08 * upper.sum()
+    elif found.masks is not None:
         for mask, box, known in zip(found.masks[order], found.boxes[order], protos(), strict=False):
             scale = HEIGHT // mask.shape[0]
             y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] * scale + scale / 2
@@ -358,7 +392,7 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         network = OnnxNetwork(path)
     except ValueError as error:
         assert form in ASKED, error
-        said = ("say which by `", "known are")
+        said = ("say which by `form`", "known are")
         assert "has the outputs" in str(error) and any(words in str(error) for words in said)
     else:
         assert form not in ASKED
@@ -366,13 +400,30 @@ def test_no_form_is_taken_for_another(tmp_path, form):
         check_known(form, found)
 
 
-@pytest.mark.parametrize("last", [17.0, 1.0])
-def test_scores_of_1_are_no_classes(tmp_path, last):
-    """In tables with the number of the picture, whose class may stand before the score or after."""
-    row = [0, 10, 20, 30, 40, 18.0 - last, last]
-    path = write_detector(tmp_path / "n.onnx", SIZE, {"out": np.array([row], np.float32)})
-    (found,) = OnnxNetwork(path)(np.zeros((1, 3, *SIZE), np.float32))
-    assert (found.labels.tolist(), found.scores.tolist()) == ([17], [1])
+def test_what_a_black_picture_leaves_open_the_first_things_tell():
+    """And it is kept: what does not fit then is an error."""
+    some, parts = dict(a=BOXES, b=LABELS, c=SCORES), dict(a=IN_PARTS, b=LABELS, c=SCORES)
+    for black in (0, 1, 2):
+        outputs = {name: 0 * values[:black] for name, values in some.items()}
+        form = form_of(Network(outputs, SIZE, {}, 0, ()))
+        for first, other in ((some, some), (parts, parts), (parts, some)):
+            kept, (found,) = decode(form, first, 1, SIZE, 0.3)
+            check_known("own", found)
+            if first is other:
+                check_known("own", decode(kept, other, 1, SIZE, 0.3)[1][0])
+            else:
+                said = "boxes must be parts of the picture, but reach"
+                refused(said, decode, kept, other, 1, SIZE, 0.3)
+    flat = Network(dict(a=np.zeros((0, 7))), SIZE, {}, 0, ())
+    for pair, label, score in (
+        ((1, 17), 17, 1), ((17, 1), 17, 1), ((0.5, 0), 0, 0.5), ((1, 0), 0, 1), ((1, 1), 1, 1)
+    ):  # fmt: skip
+        rows = np.array([[0, 10, 20, 30, 40, *pair]], np.float16)
+        form, (found,) = decode(form_of(flat), dict(a=rows), 1, SIZE, 0.3)
+        assert (found.labels, found.scores) == (label, score)
+        assert ("either" in form.where) == (pair == (1, 1))  # both are the same
+    rows[0, 5:] = 17, 1.5
+    refused(r"score up to 1 and a class, got 17, 1\.5", decode, form, dict(a=rows), 1, SIZE, 0.3)
 
 
 @pytest.mark.filterwarnings("error")
@@ -389,20 +440,16 @@ def test_logits_may_be_very_low(tmp_path):
 
 
 def test_words_that_do_not_fit_are_told(tmp_path):
-    for form, words, said in (
-        ("detect", {"task": "pose"}, "`task` must be detect, got pose"),
-        (
-            "detect",
-            {"task": "boxes"},
-            "`task` must be one of detect, pose, obb, segment, got boxes",
-        ),
-        ("own", {"task": "pose"}, "`task` is pose, but the form '.*' has no keypoints"),
-        ("own", {"scores": "sigmoid"}, "`scores` is for the logits of transformers"),
-        ("DETR, told", {"scores": "tanh"}, "`scores` must be one of softmax, sigmoid, got tanh"),
+    for form, word, said in (
+        ("detect", "pose", "`form` must be one that its outputs may have, detect, got pose"),
+        ("table", "pose", "may have, detect or rtdetr or table, got pose"),
+        ("own", "sigmoid", "may have, boxes, got sigmoid"),
+        ("own", "tanh", "`form` must be one of detect, pose, .*, numbers, got tanh"),
+        ("own", "numbers", "known are the forms"),
+        ("table in parts", None, "may be rtdetr or table: say which by `form`"),
     ):
         path, _ = written(tmp_path, form)
-        with pytest.raises(ValueError, match=said):
-            OnnxNetwork(path, **words)
+        refused(said, OnnxNetwork, path, form=word)
 
 
 def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):
@@ -419,9 +466,18 @@ def test_names_are_those_of_the_file_or_of_the_configuration(tmp_path):
 def test_what_is_no_detector_stays_numbers_or_maps(tmp_path):
     seven = np.array([[0.0, 0.5, 0.1, 0.1, 0.1, 0.15, 0.05]], np.float32)  # as of emotions
     pooled = np.zeros((1, 1, 5, 7), np.float32)  # a map of a 32nd
-    for value, kind in ((seven, "numbers"), (pooled, "maps")):
-        path = write_detector(tmp_path / "n.onnx", SIZE, {"out": value})
-        assert (OnnxNetwork(path).kind, OnnxNetwork(path).form) == (kind, None)
+    best = dict(score=np.full(1, 0.6, np.float32), label=np.array([2]))  # of a classifier
+    four = np.array([[0.1, 0.2, 3.0, 0.5]], np.float32)
+    for outputs, kind, word in (
+        (dict(out=seven), "numbers", None), (dict(out=pooled), "maps", None),
+        (dict(ids=np.ones((1, 5, 7), np.int64)), "maps", None),
+        (best | dict(logits=four), "numbers", None),
+        (best | dict(a=four[:, ::-1]), "numbers", None),
+        (best | dict(a=four), "numbers", "numbers"),
+    ):  # fmt: skip
+        network = OnnxNetwork(write_detector(tmp_path / "n.onnx", SIZE, outputs), form=word)
+        assert (network.kind, network.form) == (kind, None)
+    refused("may be boxes or numbers: say which by `form`", OnnxNetwork, tmp_path / "n.onnx")
 
 
 def test_boxes_of_cells_are_corners_with_probabilities(tmp_path):

@@ -126,9 +126,9 @@ def test_scores_of_overlapping_boxes_must_be_probabilities(tmp_path):
             changed[..., columns] = low + (high - low) * table[..., columns]
             path = write_detector(tmp_path / "n.onnx", (96, 96), {"out": changed})
             if is_known:
-                assert OnnxNetwork(path).form == "YOLOX"
+                assert OnnxNetwork(path).form == "yolox"
                 continue
-            said = "that of YOLOX, but its scores must be from 0 to 1, got .*sigmoid"
+            said = "that of yolox, but its scores must be from 0 to 1, got .*sigmoid"
             refused(said, OnnxNetwork, path)
 
 
@@ -145,8 +145,26 @@ def test_the_size_is_the_graphs_or_given(tmp_path):
     onnx.helper.set_model_props(model, {"imgsz": "[16, 24]"})  # as Ultralytics writes it
     onnx.save(model, free)
     assert OnnxNetwork(free).size == (16, 24) and OnnxNetwork(free, (32, 8)).size == (32, 8)
+    text = """<ir_version: 8, opset_import: ["" : 18]> network (float[1,3,H,W] images) =>
+        (float[1,3,16,24] same) { shape = Constant<value_ints=[1, 3, 16, 24]>()
+        same = Reshape(images, shape) }"""
+    onnx.save(onnx.parser.parse_model(text), wide)
+    for path, size, said in (
+        (
+            wide,
+            (32, 24),
+            r"onnxruntime cannot run .*\{1,3,32,24\}.*Perhaps 32,24 is no `size` that",
+        ),
+        (
+            write_graph(free, "maps"),
+            (15, 25),
+            r"halves .*; known are .* 15,25 is no `size` that it",
+        ),
+    ):
+        refused(said, OnnxNetwork, path, size)
     for path, size, wanted in (
-        (fixed, (24, 16), "16,24 for"), (fixed, (16, 25), "16,24"), (wide, (16, 16), "any,24"),
+        (fixed, (24, 16), "16,24 for"), (fixed, (16, 25), "16,24"),
+        (write_graph(wide, size=("H", 24)), (16, 16), "any,24"),
     ):  # fmt: skip
         refused(f"`size` must be {wanted} .*got {size[0]},{size[1]}", OnnxNetwork, path, size)
 
@@ -174,8 +192,18 @@ def test_other_inputs_and_files_are_told(tmp_path):
     refused(f"{said}.*; it must have one, pictures", OnnxNetwork, path)
     path = write_graph(tmp_path / "double.onnx", dtype="double", size=SIZE)
     refused(r"double.onnx has the inputs images .* of tensor\(double", OnnxNetwork, path)
-    (tmp_path / "none.onnx").write_text("no network")
-    refused(r"onnxruntime cannot read .*none\.onnx", OnnxNetwork, tmp_path / "none.onnx")
+    good, other = write_graph(tmp_path / "good.onnx").read_bytes(), tmp_path / "other.onnx"
+    for content, said in (
+        (b"\n<!DOCTYPE html><html>", r"other.onnx is a page of HTML"),
+        (b"version https://git-lfs.github.com/spec/v1", "a pointer of Git LFS .* `git lfs pull`"),
+        (b"PK\x03\x04\0\0", "such as a checkpoint of torch or Keras: export the network to ONNX"),
+        (b"Entry not found", "is text, not a network"),
+        (good[: len(good) // 2], "onnxruntime cannot read .*other.onnx: .*parsing failed"),
+        (b"\x08\x63" + good[2:], "IR version 99, and onnxruntime reads [0-9]+ at most"),
+        (good[:-1] + b"\x63", "operator set 99 of ai.onnx, and onnxruntime knows [0-9]+ at most"),
+    ):
+        other.write_bytes(content)
+        refused(said, OnnxNetwork, other)
     with pytest.raises(FileNotFoundError, match=r"there is no file .*gone\.onnx"):
         OnnxNetwork(tmp_path / "gone.onnx")
     onnx = pytest.importorskip("onnx")

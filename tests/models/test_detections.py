@@ -119,14 +119,14 @@ def test_every_form_of_detections_gives_the_same():
     class Batched(nn.Module):  # all pictures have as many boxes, with more values of each
         def forward(self, x):
             boxes = torch.tensor([[20.0, 30.0, 60.0, 90.0], [100.0, 90.0, 160.0, 150.0]])
-            rows = torch.arange(len(x) * 2.0).view(-1, 2)
-            return dict(
-                boxes=boxes.expand(len(x), -1, -1), scores=rows, labels=rows.long(), own=rows
-            )
+            rows = torch.arange(len(x) * 3.0).view(-1, 3)  # the last one is none
+            boxes = torch.cat((boxes, boxes[:1])).expand(len(x), -1, -1)
+            counts = dict(num_dets=torch.full((len(x), 1), 2))
+            return counts | dict(boxes=boxes, scores=rows, labels=rows.long(), own=rows)
 
     view = make_view("mercator", (200, 200))
     batched = LensAdapter(Batched(), view=view)(images, lens)
-    assert [found["own"].tolist() for found in batched] == [[1, 0], [3, 2]]  # the best first
+    assert [found["own"].tolist() for found in batched] == [[1, 0], [4, 3]]  # the best first
     boxes = torch.tensor([[20.0, 30.0, 60.0, 90.0], [100.0, 90.0, 160.0, 150.0]])
     exact, _ = of_boxes.carry(boxes, view.at(lens, SIZE).to_image)
     for found in batched:

@@ -10,6 +10,7 @@ Source: cocodataset.org/#format-data.
 import json
 import math
 import os
+import re
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -207,9 +208,9 @@ def coco_annotations(instances: Instances) -> list[dict[str, Any]]:
 
 def picture_ids(names: Iterable[str]) -> dict[str, int]:
     """The ids of pictures in COCO by their names: like other tools, the numbers that their files
-    have as names, if no two are the same. All others are known by their names."""
+    have as names, if no two are the same. All others need numbers of their own."""
     stems = {name: name.rpartition("/")[2] for name in names}
-    ids = {name: int(stem) for name, stem in stems.items() if stem.isdecimal()}
+    ids = {name: int(stem) for name, stem in stems.items() if re.fullmatch(r"[0-9]{1,18}", stem)}
     return ids if len({*ids.values()}) == len(ids) else {}
 
 
