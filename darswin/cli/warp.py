@@ -293,11 +293,12 @@ def _write(
             os.path.normpath(name): [file for file, _ in new.pictures]
             for name, new in zip(data.files, warped, strict=True)
         }
-        said, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
+        said, missing, lost = moved_splits(Path(settings["yolo"]), folder, new_names)
         write_yolo(folder, pictures, data.categories, said)
         for split in missing:
             print(f"left out of data.yaml, because it is not in {data.folder}: {split}")
     else:
+        lost = []
         write_coco(folder / COCO, pictures, data.categories)
     if isinstance(view, CameraView):
         save(view.lens, folder / LENS)
@@ -320,7 +321,7 @@ def _write(
     ]  # fmt: skip
     replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
     bad = [new.error for new in warped if new.error]
-    wrong = [*data.wrong, *(text for new in warped for text in new.wrong)]
+    wrong = [*data.wrong, *lost, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)
