@@ -9,11 +9,11 @@ Source: docs.ultralytics.com/datasets.
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,14 +23,7 @@ from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import files_below
-from darswin.data.labels.judge import (
-    MIDDLE,
-    boxes_with_more,
-    check_form,
-    check_place,
-    check_shares,
-    similar,
-)
+from darswin.data.labels.judge import MIDDLE, boxes_with_more, check_form, check_place, check_shares
 from darswin.data.labels.labels import (
     LabelledPictures,
     Labels,
@@ -60,19 +53,22 @@ def read_yolo(path: str | Path) -> LabelledPictures:
 
     Raises:
         FileNotFoundError: no classes, no pictures, or no labels.
-        ValueError: from `labels(k)`, a line of another form; it names the file.
+        ValueError: lines that together are in another unit or order; or from `labels(k)`, one of
+            another form. It names the file. Texts without a picture are named in `wrong`.
     """
     root, content = _content(Path(path))
     names, shape = content["names"], content.get("kpt_shape") or (0, 0)
     pictures = pictures_in(root)
-    texts = {stem: str(_text_of(root, Path(stem))) for stem in pictures}
-    if not any(Path(text).is_file() for text in texts.values()):
-        raise FileNotFoundError(f"no labels in {root}: the first would be {min(texts.values())}")
-    lines = [_lines(text, len(names), shape) for text in texts.values()]
+    texts = [_text_of(root, Path(stem)) for stem in pictures]
+    if not any(text.is_file() for text in texts):
+        raise FileNotFoundError(f"no labels in {root}: the first would be {texts[0]}")
+    lines = [_lines(text) for text in texts]
+    with_more = _judge(root, [line for of_picture in lines for line in of_picture], shape[0] > 0)
     calibration = calibration_in(root)
     return LabelledPictures(
-        root, [str(Path(file).relative_to(root)) for file in pictures.values()],
-        _judged(root, lines), _labels, [{"id": k, "name": name} for k, name in enumerate(names)],
+        root, [str(Path(file).relative_to(root)) for file in pictures.values()], lines,
+        partial(_labels, classes=len(names), shape=shape, with_more=with_more),
+        [{"id": k, "name": name} for k, name in enumerate(names)],
         lenses=Calibrations(calibration, root) if calibration else None,
         wrong=_without_picture(root, texts),
     )  # fmt: skip
@@ -93,20 +89,20 @@ def write_yolo(
         more: other entries of `data.yaml`, such as the splits.
     """
     number = {category["id"]: k for k, category in enumerate(categories)}
-    count = ((more or {}).get("kpt_shape") or [0])[0]
+    shape = list((more or {}).get("kpt_shape") or (0, 3))
     for entry, labels in pictures:
         instances = labels.instances
         if "crowd" in instances.more:
             instances = instances[~instances.more["crowd"]]
         if instances.keypoints is not None and len(instances):
-            count = max(instances.keypoints.shape[1], count)
+            shape = [max(instances.keypoints.shape[1], shape[0]), 3]
         classes = [number[label] for label in check_labels(instances, number)]
         lines = yolo_lines(replace(instances, labels=np.array(classes)), labels.size)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))
         replace_file(text, lines)
     names = {k: category["name"] for k, category in enumerate(categories)}
     content = {"path": ".", **(more or {}), "names": names}
-    content |= {"kpt_shape": [count, 3]} if count else {}
+    content |= {"kpt_shape": shape} if shape[0] else {}
     replace_file(Path(root) / _NAMES[0], yaml.safe_dump(content, sort_keys=False))
 
 
@@ -177,10 +173,9 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
         if isinstance(names, Mapping):
             names = [names[k] for k in range(len(names))]
         content |= {"names": list(map(str, names))}
-        if shape is not None:
-            content["kpt_shape"] = [int(number) for number in shape[:2]]
-            if content["kpt_shape"][1] not in (2, 3):
-                raise ValueError(f"kpt_shape is a count, and 2 or 3 numbers of each, not {shape}")
+        content |= {} if shape is None else {"kpt_shape": [int(number) for number in shape[:2]]}
+        if content.get("kpt_shape", [0, 3])[1] not in (2, 3):
+            raise ValueError(f"kpt_shape is a count, and 2 or 3 numbers of each, not {shape}")
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{file} must name the classes 0, 1, … under names: {error}") from error
     root = file.parent / str(content.get("path") or ".")
@@ -200,7 +195,7 @@ def moved_splits(
 
     Returns:
         The entries; the splits that are left out because their pictures are not there, in words;
-        and lists whose lines name no picture, in words.
+        and lists that have lines without a picture, in words.
     """
     root, content = _content(source)
     missing, wrong = [], []
@@ -226,10 +221,10 @@ def moved_splits(
 def _below(root: Path, listed: str) -> str | None:
     """A folder or list of pictures of a split relative to `root`. Roboflow writes "../" before it,
     though it is beside data.yaml."""
-    plain = listed.replace("\\", "/")
+    listed = plain = listed.replace("\\", "/")
     while plain.startswith("../"):
         plain = plain[3:]
-    for name in (listed, listed.replace("\\", "/"), plain):
+    for name in dict.fromkeys((listed, plain)):
         place = Path(os.path.relpath(root / name, root))
         if ".." not in place.parts and (root / place).exists():
             return place.as_posix()
@@ -242,154 +237,98 @@ def _write_list(
     """Writes the list of pictures of a split, with the new names; says which lines name none."""
     lines, lost = [], []
     for line in filter(None, map(str.strip, read_text(root / name).splitlines())):
-        ways = [line, line.replace("\\", "/")]
-        places = [place / way for way in ways for place in (root / name / "..", root)]
-        files = [os.path.relpath(place, root) for place in places]
-        if (file := next((file for file in files if file in new_names), None)) is None:
-            lost.append(line)
-        else:
-            lines += new_names[file]
+        plain = line.replace("\\", "/")
+        files = [os.path.relpath(place / plain, root) for place in (root / name / "..", root)]
+        new = next((new_names[file] for file in files if file in new_names), None)
+        lines += new or ()
+        lost += [line] * (new is None)
     replace_file(folder / name, "".join(f"./{line}\n" for line in lines))
-    what = f"{root / name}: {len(lost)} lines name no picture below {root}"
-    return [f"{what}, as {some(lost)}: write them relative to it"] if lost else []
+    return [f"{root / name} lists pictures that are not in {root}, {some(lost)}"] if lost else []
 
 
-class _Line(NamedTuple):
-    """A line of a text file: its place in words, its content, and its numbers, all as shares:
-    4 of a box or pairs of an outline; and keypoints (P, 3), with COCO's v."""
-
-    place: str
-    content: str
-    category: int
-    numbers: np.ndarray
-    keypoints: np.ndarray | None
-
-    def wrong(self, reason: Any) -> str:
-        return f"{self.place} {reason}, got {self.content[:80]!r}"
-
-    @property
-    def box(self) -> np.ndarray:
-        table = self.numbers.reshape(-1, 2)
-        if len(table) > 2:
-            return box_of([table])
-        return np.concatenate((table[0] - table[1] / 2, table[0] + table[1] / 2))
-
-    def check(self, has_more: bool) -> None:
-        """ValueError for what cannot be labelled in a picture."""
-        if has_more:
-            raise ValueError(
-                "looks like a box with more numbers, such as a score and a track: keep its class "
-                "and box, or name the keypoints by kpt_shape in data.yaml"
-            )
-        unit = "shares of the sides of the picture"
-        check_place(unit, (1, 1), self.box, [self.numbers], self.keypoints)
-        if not (self.box[:2] < self.box[2:]).all():
-            raise ValueError("must have an area")
-
-
-def _lines(text: str, classes: int, shape: Sequence[int]) -> tuple[list[_Line], list[str]]:
-    """The lines of the text file of a picture, and what is wrong with others."""
-    lines, wrong = [], []
+def _lines(text: Path) -> list[tuple[str, str]]:
+    """The lines of a text, if it is there: their places in words, and their content."""
     try:
-        contents = read_text(text).splitlines() if Path(text).is_file() else []
+        lines = read_text(text).splitlines() if text.is_file() else []
     except ValueError as error:
-        return [], [str(error)]
-    for number, content in enumerate(map(str.strip, contents), 1):
-        line = _Line(f"{text}, line {number}", content, 0, np.zeros(4), None)
-        if content:
-            try:
-                lines.append(_parsed(line, classes, *shape))
-            except ValueError as error:
-                wrong.append(line.wrong(error))
-    return lines, wrong
+        return [(f"{error}:", "")]
+    return [(f"{text}, line {k}", line.strip()) for k, line in enumerate(lines, 1) if line.strip()]
 
 
-def _numbers(content: str) -> list[float]:
-    """The numbers of a line; none if it holds something else."""
+def _numbers(line: str) -> np.ndarray:
+    """The numbers of a line, of which the first is the class; none if it holds something else."""
     try:
-        return [*map(float, content.split())]
+        return np.array(line.split(), float)
     except ValueError:
-        return []
+        return np.zeros(0)
 
 
-def _without_picture(root: Path, texts: Mapping[str, str]) -> list[str]:
-    """Texts with labels that are those of no picture, in words: they are where others are."""
-    used = {Path(text) for text in texts.values()}
-    folders = {place for text in used for place in text.parents if place.name == "labels"}
-    lonely = [stem for stem, text in texts.items() if not Path(text).is_file()]
-    said = []
-    for text in map(Path, sorted(files_below(root))):
-        is_ours = text.parent in {place.parent for place in used} or folders & set(text.parents)
-        if text.suffix != ".txt" or text in used or not is_ours:
-            continue
-        lines = [line for line in read_text(text).splitlines() if len(_numbers(line)) > 4]
-        if lines:
-            other = similar(text.stem, lonely)
-            hint = f": it may be that of the picture {other}" if other else ""
-            said.append(f"{text}: no picture has this name, for {len(lines)} labels{hint}")
-    return said
+def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
+    """Texts with labels that are those of no picture, in words, where those of pictures are."""
+    used, folders = set(texts), {text.parent for text in texts}
+    folders |= {place for folder in folders for place in folder.parents if place.name == "labels"}
+    alone = [text for text in map(Path, files_below(root)) if text not in used]
+    return [
+        f"{text} has {count} labels, but no picture has its name: perhaps a tool changed it"
+        for text in alone if text.suffix == ".txt" and not folders.isdisjoint(text.parents)
+        if (count := sum(len(_numbers(line)) > 4 for _, line in _lines(text)))
+    ]  # fmt: skip
 
 
-def _parsed(line: _Line, classes: int, count: int, per_keypoint: int) -> _Line:
-    category, *rest = _numbers(line.content) or [-1.0]
-    numbers = np.array(rest)
-    more = count * per_keypoint
-    is_form = len(numbers) == 4 or (
-        len(numbers) == 4 + more if more else len(numbers) >= 6 and len(numbers) % 2 == 0
+def _judge(root: Path, lines: Sequence[tuple[str, str]], has_keypoints: bool) -> frozenset[str]:
+    """The places of lines that are boxes with more numbers. ValueError if the lines of all texts
+    are in another unit or order than YOLO's."""
+    rows = [(place, _numbers(line)[1:]) for place, line in lines]
+    check_shares(rows)
+    check_form(root, MIDDLE, [row[:4] for _, row in rows if len(row) == 4 or has_keypoints])
+    outlines = (
+        [] if has_keypoints else [(p, row) for p, row in rows if len(row) > 5 and len(row) % 2 == 0]
     )
-    if not (category in range(classes) and is_form and np.isfinite(numbers).all()):
-        others = f"{more} of keypoints, as kpt_shape says" if more else "pairs of an outline"
-        raise ValueError(
-            f"must be a class below {classes} and 4 numbers of a box, or {others}; it has "
-            f"{len(line.content.split())} numbers"
-        )
-    keypoints = None
-    if more and len(numbers) > 4:
-        keypoints = numbers[4:].reshape(-1, per_keypoint)
-        visibility = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
-        keypoints = np.column_stack((keypoints[:, :2], visibility))
-        numbers = numbers[:4]
-    return line._replace(category=int(category), numbers=numbers, keypoints=keypoints)
+    return frozenset(boxes_with_more(outlines))
 
 
-def _judged(
-    root: Path, files: Sequence[tuple[list[_Line], list[str]]]
-) -> list[tuple[list[_Line], list[str]]]:
-    """The lines of each file that can be right, after a look at all of them; and what is wrong with
-    others."""
-    lines = [line for of_file, _ in files for line in of_file]
-    check_shares([(line.place, line.numbers) for line in lines])
-    outlines = [line for line in lines if len(line.numbers) > 4]
-    has_more = boxes_with_more([line.numbers for line in outlines])
-    with_more = {line.place for line in compress(outlines, has_more)}
-    boxes = [line.numbers for line in lines if len(line.numbers) == 4]
-    check_form(root, MIDDLE, np.reshape(boxes, (-1, 4)))
-    judged = []
-    for of_file, wrong in files:
-        kept, wrong = [], list(wrong)
-        for line in of_file:
-            try:
-                line.check(line.place in with_more)
-                kept.append(line)
-            except ValueError as error:
-                wrong.append(line.wrong(error))
-        judged.append((kept, wrong))
-    return judged
-
-
-def _labels(raw: tuple[Sequence[_Line], list[str]], size: Size) -> tuple[Labels, list[str]]:
-    lines, wrong = raw
-    sides, instances = np.array(size[::-1]), []
-    for line in lines:
-        table = line.numbers.reshape(-1, 2) * sides
-        has_outline = len(table) > 2 and area_of(table) > NO_AREA
-        keypoints = None if line.keypoints is None else line.keypoints * [*sides, 1]
-        instances.append(
-            labelled(
-                line.category,
-                line.box * [*sides, *sides],
-                outline=[table] if has_outline else (),
-                keypoints=keypoints,
-            )
-        )
+def _labels(
+    lines: Sequence[tuple[str, str]], size: Size, classes: int, shape: Sequence[int],
+    with_more: Collection[str],
+) -> tuple[Labels, list[str]]:  # fmt: skip
+    instances, wrong = [], []
+    for place, line in lines:
+        try:
+            if place in with_more:
+                raise ValueError(
+                    "looks like a box with more numbers, such as a score and a track: keep the box"
+                    ", or tell the keypoints by kpt_shape in data.yaml"
+                )
+            instances.append(_instance(_numbers(line), np.array(size[::-1]), classes, *shape))
+        except ValueError as error:
+            wrong.append(f"{place} {error}, got {line[:80]!r}")
     return Labels(Instances.joined(instances), size), wrong
+
+
+def _instance(
+    numbers: np.ndarray, sides: np.ndarray, classes: int, count: int, per_keypoint: int
+) -> Instances:
+    category, numbers = numbers[0] if len(numbers) else -1.0, numbers[1:]
+    keypoints, more = None, count * per_keypoint
+    is_form = len(numbers) == 4 + more if more else len(numbers) in range(6, 2**31, 2)
+    if not (category in range(classes) and np.isfinite(numbers).all()) or not (
+        is_form or len(numbers) == 4
+    ):
+        others = f"{more} of keypoints, by kpt_shape" if more else "pairs of an outline"
+        raise ValueError(f"must be a class below {classes} and 4 numbers of a box, or {others}")
+    if len(numbers) == 4 + more > 4:
+        keypoints = numbers[4:].reshape(-1, per_keypoint)
+        numbers = numbers[:4]
+        visibility = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
+        keypoints = np.column_stack((keypoints[:, :2] * sides, visibility))
+    table = numbers.reshape(-1, 2) * sides
+    if len(table) == 2:
+        box = np.concatenate((table[0] - table[1] / 2, table[0] + table[1] / 2))
+    else:
+        box = box_of([table])
+    if not (box[:2] < box[2:]).all():
+        raise ValueError("must have an area")
+    check_place("shares of the sides of the picture", sides, box, [table], keypoints)
+    has_outline = len(table) > 2 and area_of(table) > NO_AREA
+    outline = [table] if has_outline else ()
+    return labelled(int(category), box, outline=outline, keypoints=keypoints)
