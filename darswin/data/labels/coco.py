@@ -108,28 +108,19 @@ def _judge(path: Path, entries: Sequence[Mapping], of_picture: Mapping[Any, list
     annotations = [annotation for group in of_picture.values() for annotation in group]
     parts = [one.get("segmentation") for one in annotations]
     outlines = (part for outline in parts if isinstance(outline, list) for part in outline)
-    check_pixels(path, "boxes", (_rows(one.get("bbox"), 4) for one in annotations))
-    check_pixels(path, "outlines", (_rows(part, 2) for part in outlines))
-    keypoints = (_rows(one.get("keypoints"), 3)[:, :2] for one in annotations)
-    check_pixels(path, "keypoints", keypoints)
-    rows = [np.zeros((0, 7))]
-    for entry in entries:
-        sides = [_side(entry.get("width")), _side(entry.get("height"))]
-        for one in of_picture[entry["id"]]:
-            if isinstance(box := one.get("bbox"), list) and not one.get("segmentation"):
-                rows.append(_rows([*box, one.get("area") or 0, *sides], 7))
-    table = np.concatenate(rows)
-    boxes, areas, sides = np.split(table[(table[:, 5:] > 0).all(1)], [4, 5], 1)
+    check_pixels(path, "boxes", (_table(one.get("bbox"), 4) for one in annotations))
+    check_pixels(path, "outlines", (_table(part, 2) for part in outlines))
+    points = (_table(one.get("keypoints"), 3)[:, :2] for one in annotations)
+    check_pixels(path, "keypoints", points)
+    rows = [
+        _table([*box, one.get("area") or 0, entry.get("width"), entry.get("height")], 7)
+        for entry in entries for one in of_picture[entry["id"]]
+        if isinstance(box := one.get("bbox"), list) and not one.get("segmentation")
+    ]  # fmt: skip
+    table = np.concatenate([np.zeros((0, 7)), *rows])
+    table = table[np.isfinite(table).all(1) & (table[:, 5:] > 0).all(1)]
+    boxes, areas, sides = np.split(table, [4, 5], 1)
     check_form(path, SIDES, boxes / np.tile(sides, 2), areas[:, 0] / sides.prod(1))
-
-
-def _rows(values: Any, group: int) -> np.ndarray:
-    """The rows of finite numbers of a table that a file has; none if it has something else."""
-    try:
-        table = np.asarray(values, float).reshape(-1, group)
-    except (TypeError, ValueError):
-        return np.zeros((0, group))
-    return table[np.isfinite(table).all(1)]
 
 
 def coco_files(folder: Path) -> list[Path]:
@@ -277,7 +268,7 @@ def _labels(
     instances, wrong = [], []
     for annotation in annotations:
         try:
-            instances.append(_instance(annotation, *points[annotation["category_id"]], size))
+            instances.append(_instance(annotation, size, *points[annotation["category_id"]]))
         except ValueError as error:
             wrong.append(f"{path}: the annotation {annotation.get('id')} {error}")
     return Labels(Instances.joined(instances), size), wrong
@@ -291,11 +282,16 @@ def _side(side: Any) -> Any:
         return side
 
 
-def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+def _table(values: Any, group: int) -> np.ndarray:
+    """The numbers that a file has, in rows; one row of NaN for what is no such table."""
     try:
-        table = np.asarray(values, float).reshape(-1, group)
+        return np.asarray(values, float).reshape(-1, group)
     except (TypeError, ValueError):
-        table = np.full((1, group), math.nan)
+        return np.full((1, group), math.nan)
+
+
+def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+    table = _table(values, group)
     if len(table) < least or not np.isfinite(table).all():
         raise ValueError(
             f"has the {name} {reprlib.repr(values)}, which must be finite numbers, {group} each"
@@ -304,7 +300,7 @@ def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
 
 
 def _instance(
-    annotation: Mapping[str, Any], count: int, mirror: Sequence[int], size: Size
+    annotation: Mapping[str, Any], size: Size, count: int, mirror: Sequence[int]
 ) -> Instances:
     segments = annotation.get("segmentation") or ()
     polygons, rle, mask = [], None, np.zeros(size, bool)
@@ -340,7 +336,7 @@ def _instance(
         if count and len(keypoints) not in (0, count):
             raise ValueError(f"has {len(keypoints)} keypoints, but its category has {count}")
     check_place("pixels", size[::-1], box, polygons, keypoints)
-    if (mode := annotation.get("bbox_mode", 1)) != 1:
+    if str(mode := annotation.get("bbox_mode", 1)).split(".")[-1] not in ("1", "XYWH_ABS"):
         raise ValueError(f"has bbox_mode {mode}, but COCO's boxes are {SIDES}, bbox_mode 1")
     is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
     if is_crowd is None:

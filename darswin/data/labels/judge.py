@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 
 SIDES, MIDDLE, CORNERS = "x, y, width, height", "the middle, width, height", "x0, y0, x1, y1"
+# Factors of the four numbers of a box, for the corners (first, last) of either side.
 _CORNERS_OF = {
-    name: np.kron(table, np.eye(2))  # from the four numbers of a box
-    for name, table in ((CORNERS, [[1, 0], [0, 1]]), (SIDES, [[1, 1], [0, 1]]),
-                        (MIDDLE, [[1, 1], [-0.5, 0.5]]))
+    name: np.kron(np.array(table), np.eye(2))
+    for name, table in (
+        (CORNERS, [[1.0, 0.0], [0.0, 1.0]]), (SIDES, [[1.0, 1.0], [0.0, 1.0]]),
+        (MIDDLE, [[1.0, 1.0], [-0.5, 0.5]]),
+    )
 }  # fmt: skip
 # How many boxes it takes to tell: those of things that are cut off reach beyond the picture.
 _LEAST = {CORNERS: 3, SIDES: 20, MIDDLE: 20}
@@ -52,7 +55,7 @@ def check_form(path: Path, form: str, boxes: Any, areas: Any = 0.0) -> None:
 def _odd(form: str, boxes: np.ndarray) -> np.ndarray:
     """Which boxes (N, 4) reach beyond the picture, or have no area."""
     low, high = np.split(boxes @ _CORNERS_OF[form], 2, axis=1)
-    return ~((low >= -_OVER) & (high <= 1 + _OVER) & (low < high)).all(1)
+    return ~np.all((low >= -_OVER) & (high <= 1 + _OVER) & (low < high), axis=1)
 
 
 def check_pixels(path: Path, what: str, rows: Iterable[np.ndarray]) -> None:
@@ -61,7 +64,7 @@ def check_pixels(path: Path, what: str, rows: Iterable[np.ndarray]) -> None:
     for numbers in rows:
         if (np.abs(numbers) > _PIXEL).any():
             return
-        has_parts |= bool((numbers % 1).any())
+        has_parts |= bool((numbers % 1 > 0).any())
     if has_parts:
         raise ValueError(
             f"{path}: the {what} lie all within the first pixel, so they look like shares of the "

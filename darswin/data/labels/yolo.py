@@ -235,7 +235,8 @@ def _write_list(
     root: Path, name: str, folder: Path, new_names: Mapping[str, Sequence[str]]
 ) -> list[str]:
     """Writes the list of pictures of a split, with the new names; says which lines name none."""
-    lines, lost = [], []
+    lines: list[str] = []
+    lost: list[str] = []
     for line in filter(None, map(str.strip, read_text(root / name).splitlines())):
         plain = line.replace("\\", "/")
         files = [os.path.relpath(place / plain, root) for place in (root / name / "..", root)]
@@ -266,11 +267,13 @@ def _numbers(line: str) -> np.ndarray:
 def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
     """Texts with labels that are those of no picture, in words, where those of pictures are."""
     used, folders = set(texts), {text.parent for text in texts}
-    folders |= {place for folder in folders for place in folder.parents if place.name == "labels"}
+    roots = {place for folder in folders for place in (folder, *folder.parents)}
+    roots = {place for place in roots if place.name == "labels"}
     alone = [text for text in map(Path, files_below(root)) if text not in used]
     return [
-        f"{text} has {count} labels, but no picture has its name: perhaps a tool changed it"
-        for text in alone if text.suffix == ".txt" and not folders.isdisjoint(text.parents)
+        f"{text} has {count} labels, but no picture that is read has its name"
+        for text in alone
+        if text.suffix == ".txt" and (text.parent in folders or not roots.isdisjoint(text.parents))
         if (count := sum(len(_numbers(line)) > 4 for _, line in _lines(text)))
     ]  # fmt: skip
 
