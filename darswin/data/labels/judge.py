@@ -85,15 +85,15 @@ def check_shares(rows: Sequence[tuple[str, np.ndarray]]) -> None:
 
 def boxes_with_more(rows: Sequence[tuple[str, np.ndarray]]) -> list[str]:
     """The places of rows, of 6, 8 or more numbers, that are no outlines, but boxes with more: the
-    score and the number of a track, in any order, or keypoints. Those are whole in all rows."""
+    score and the number of a track, in any order, or keypoints. Those are whole, in all rows."""
     places = []
     for is_short in (True, False):
         part = [(place, row) for place, row in rows if (len(row) == 6) == is_short]
         ends = np.array([(*row[:6], *row[-2:]) for _, row in part]).reshape(-1, 8)
         whole = (ends % 1 == 0).all(0)
         are_boxes = is_short and len(ends) > 2 and not _odd(MIDDLE, ends[:, :4]).any()
-        if (ends[:, whole] > 1).any() or (are_boxes and whole[-2:].any()):
-            places += [place for place, _ in part]
+        are_all = (ends[:, whole] > 1).any() or (are_boxes and whole[-2:].any())
+        places += [place for place, row in part if are_all or ((row % 1 == 0) & (row > 1)).any()]
     return places
 
 

@@ -281,7 +281,7 @@ def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
 def _judge(root: Path, lines: Sequence[tuple[str, str]], has_keypoints: bool) -> frozenset[str]:
     """The places of lines that are boxes with more numbers. ValueError if the lines of all texts
     are in another unit or order than YOLO's."""
-    rows = [(place, _numbers(line)[1:]) for place, line in lines]
+    rows = [(place, row[1:]) for place, line in lines if len(row := _numbers(line)) > 4]
     check_shares(rows)
     check_form(root, MIDDLE, [row[:4] for _, row in rows if len(row) == 4 or has_keypoints])
     outlines = (
