@@ -391,12 +391,7 @@ def test_what_yolo_lists_in_vain_is_named(capsys):
     shape = {"kpt_shape": [2, 3], "names": ["hand"]}
     Path("in/data.yaml").write_text(yaml.safe_dump(shape | {"train": "train.txt"}))
     said = refused(capsys, "in", WIDE)
-    for words in (
-        "3 pictures",
-        "a.txt, line 1 must be",
-        "b_1.txt has 1 labels",
-        r"'C:\\\\set\\\\im",
-    ):
+    for words in ("3 pictures", "a.txt, line 1 must be", "b_1.txt has 1 labels", "not in in, ['C:"):
         assert words in said
     assert Path("out/train.txt").read_text() == "./images/a.png\n"
     assert yaml.safe_load(Path("out/data.yaml").read_text())["kpt_shape"] == [2, 3]

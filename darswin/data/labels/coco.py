@@ -23,7 +23,7 @@ from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask
 from darswin.boxes.turned import as_turned
 from darswin.data.cameras import Calibrations
-from darswin.data.labels.judge import SIDES, check_form, check_pixels, check_place
+from darswin.data.labels.judge import SIDES, check_form, check_pixels
 from darswin.data.labels.labels import (
     LabelledPictures,
     Labels,
@@ -335,7 +335,6 @@ def _instance(
         keypoints = _numbers("keypoints", keypoints, 3, 0)
         if count and len(keypoints) not in (0, count):
             raise ValueError(f"has {len(keypoints)} keypoints, but its category has {count}")
-    check_place("pixels", size[::-1], box, polygons, keypoints)
     if str(mode := annotation.get("bbox_mode", 1)).split(".")[-1] not in ("1", "XYWH_ABS"):
         raise ValueError(f"has bbox_mode {mode}, but COCO's boxes are {SIDES}, bbox_mode 1")
     is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
@@ -356,7 +355,7 @@ def _instance(
         raise ValueError(f"has visible {visible!r}, which must be a share from 0 to 1")
     return labelled(
         annotation["category_id"], box, outline=polygons, mask=rle, crowd=is_crowd,
-        visible=visible, keypoints=keypoints, mirror=mirror, entry=entry,
+        visible=visible, keypoints=keypoints, mirror=mirror, entry=entry, size=size,
     )  # fmt: skip
 
 

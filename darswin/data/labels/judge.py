@@ -4,26 +4,19 @@ Programs write them in other units and orders than those of the format. What can
 has it is an error, which says what it looks like.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 SIDES, MIDDLE, CORNERS = "x, y, width, height", "the middle, width, height", "x0, y0, x1, y1"
-# Factors of the four numbers of a box, for the corners (first, last) of either side.
-_CORNERS_OF = {
-    name: np.kron(np.array(table), np.eye(2))
-    for name, table in (
-        (CORNERS, [[1.0, 0.0], [0.0, 1.0]]), (SIDES, [[1.0, 1.0], [0.0, 1.0]]),
-        (MIDDLE, [[1.0, 1.0], [-0.5, 0.5]]),
-    )
-}  # fmt: skip
-# How many boxes it takes to tell: those of things that are cut off reach beyond the picture.
-_LEAST = {CORNERS: 3, SIDES: 20, MIDDLE: 20}
+# Of a box (a, b): how many of them it takes to tell, as things that are cut off may reach beyond
+# the picture; and the factors of its first corner, a + start b, and its last, step first + b.
+_FORMS = {CORNERS: (3, 0.0, 0.0), SIDES: (20, 0.0, 1.0), MIDDLE: (20, -0.5, 1.0)}
 _OVER = 0.02  # a share of a side: boxes that reach farther beyond the picture are odd
 _ODD, _FEW = 0.1, 0.02  # with more odd boxes a form does not fit, with fewer it does
-_FAR = 3.0  # times a side of the picture: nothing reaches that far
+_FAR = 1.5  # times a side: most numbers of a thing are less
 _PIXEL = 1.1  # px: no file has all its numbers in the first pixel
 
 
@@ -36,26 +29,29 @@ def check_form(path: Path, form: str, boxes: Any, areas: Any = 0.0) -> None:
     """
     table = np.reshape(boxes, (-1, 4))
     table = np.unique(np.column_stack((table, np.broadcast_to(areas, len(table)))), axis=0)
-    odd = {name: _odd(name, table[:, :4]) for name in _LEAST}
-    wide = {name: np.subtract(*np.split(table[:, :4] @ _CORNERS_OF[name], 2, 1)) for name in _LEAST}
-    same = {name: np.isclose(wide[name].prod(1), table[:, 4], 0.02, 0) for name in _LEAST}
-    for name, least in _LEAST.items():
+    odd, same = {}, {}
+    for name in _FORMS:
+        odd[name], sizes = _odd(name, table)
+        same[name] = np.isclose(sizes, table[:, 4], 0.02, 0)
+    for name, (least, *_) in _FORMS.items():
         by_area = same[name] & ~same[form]
         misfits = (by_area | odd[form]).sum()
         doubts = (odd[name] | (same[form] & ~same[name])).sum()
-        if doubts <= _FEW * len(table) and misfits >= max(
-            _ODD * len(table), least - 2 * by_area.sum()
-        ):
+        enough = max(_ODD * len(table), least - 2 * by_area.sum())
+        if doubts <= _FEW * len(table) and misfits >= enough:
             raise ValueError(
                 f"{path}: {misfits} of {len(table)} boxes cannot be {form}, as its format has "
                 f"them, but look like {name}: write them as the format has them"
             )
 
 
-def _odd(form: str, boxes: np.ndarray) -> np.ndarray:
-    """Which boxes (N, 4) reach beyond the picture, or have no area."""
-    low, high = np.split(boxes @ _CORNERS_OF[form], 2, axis=1)
-    return ~np.all((low >= -_OVER) & (high <= 1 + _OVER) & (low < high), axis=1)
+def _odd(form: str, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which boxes (N, 4) reach beyond the picture, or have no area; and their areas."""
+    _, start, step = _FORMS[form]
+    low = boxes[:, :2] + start * boxes[:, 2:4]
+    high = step * low + boxes[:, 2:4]
+    fits = (low >= -_OVER) & (high <= 1 + _OVER) & (low < high)
+    return ~np.all(fits, axis=1), (high - low).prod(1)
 
 
 def check_pixels(path: Path, what: str, rows: Iterable[np.ndarray]) -> None:
@@ -72,43 +68,26 @@ def check_pixels(path: Path, what: str, rows: Iterable[np.ndarray]) -> None:
         )
 
 
-def check_shares(rows: Sequence[tuple[str, np.ndarray]]) -> None:
-    """ValueError if most rows, each with its place in words, are in another unit than shares."""
-    far = [(place, row.max()) for place, row in rows if np.median(np.abs(row)) > _FAR / 2]
+def check_shares(rows: Mapping[str, np.ndarray]) -> None:
+    """ValueError if most rows, by their places in words, are in another unit than shares."""
+    far = {place: row.max() for place, row in rows.items() if np.median(np.abs(row)) > _FAR}
     if len(far) > len(rows) / 2:
-        unit = "pixels" if max(most for _, most in far) > 100 else "per cent or pixels"
+        unit = "pixels" if max(far.values()) > 100 else "per cent or pixels"
         raise ValueError(
-            f"{far[0][0]} has numbers that look like {unit}, as {len(far)} of {len(rows)} lines "
-            "do: write them as shares of the sides of the picture"
+            f"{min(far)} has numbers that look like {unit}, as {len(far)} of {len(rows)} lines do: "
+            "write them as shares of the sides of the picture"
         )
 
 
-def boxes_with_more(rows: Sequence[tuple[str, np.ndarray]]) -> list[str]:
-    """The places of rows, of 6, 8 or more numbers, that are no outlines, but boxes with more: the
+def boxes_with_more(rows: Mapping[str, np.ndarray]) -> set[str]:
+    """The places of rows, of 6 or more numbers, that are no outlines, but boxes with more: the
     score and the number of a track, in any order, or keypoints. Those are whole, in all rows."""
-    places = []
-    for is_short in (True, False):
-        part = [(place, row) for place, row in rows if (len(row) == 6) == is_short]
-        ends = np.array([(*row[:6], *row[-2:]) for _, row in part]).reshape(-1, 8)
+    places: set[str] = set()
+    for count in (range(6, 7), range(8, 2**31, 2)):
+        part = {place: row for place, row in rows.items() if len(row) in count}
+        ends = np.array([(*row[:6], *row[-2:]) for row in part.values()]).reshape(-1, 8)
         whole = (ends % 1 == 0).all(0)
-        are_boxes = is_short and len(ends) > 2 and not _odd(MIDDLE, ends[:, :4]).any()
+        are_boxes = len(ends) > 2 and 6 in count and not _odd(MIDDLE, ends)[0].any()
         are_all = (ends[:, whole] > 1).any() or (are_boxes and whole[-2:].any())
-        places += [place for place, row in part if are_all or ((row % 1 == 0) & (row > 1)).any()]
+        places |= {p for p, row in part.items() if are_all or ((row % 1 == 0) & (row > 1)).any()}
     return places
-
-
-def check_place(
-    unit: str, sides: Sequence[float] | np.ndarray, box: np.ndarray,
-    outlines: Sequence[np.ndarray], keypoints: np.ndarray | None,
-) -> None:  # fmt: skip
-    """ValueError for what cannot be seen in a picture with these sides (W, H): a box (4,) that lies
-    outside of it, outlines (P, 2) or keypoints (P, 3) that are far from it; or for another v."""
-    points = np.zeros((0, 3)) if keypoints is None else keypoints
-    if not ((points[:, 2] >= 0) & (points[:, 2] <= 2)).all():
-        raise ValueError("has keypoints whose third number, v, is not 0, 1 or 2")
-    places = [
-        place.reshape(-1, 2) / sides for place in (box, *outlines, points[points[:, 2] > 0, :2])
-    ]
-    is_far = any((np.abs(place) > _FAR).any() for place in places)
-    if is_far or not ((places[0][0] < 1) & (places[0][1] > 0)).all():
-        raise ValueError(f"must lie in its picture, with numbers that are {unit}")

@@ -9,7 +9,7 @@ Source: docs.ultralytics.com/datasets.
 """
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import files_below
-from darswin.data.labels.judge import MIDDLE, boxes_with_more, check_form, check_place, check_shares
+from darswin.data.labels.judge import MIDDLE, boxes_with_more, check_form, check_shares
 from darswin.data.labels.labels import (
     LabelledPictures,
     Labels,
@@ -63,11 +63,18 @@ def read_yolo(path: str | Path) -> LabelledPictures:
     if not any(text.is_file() for text in texts):
         raise FileNotFoundError(f"no labels in {root}: the first would be {texts[0]}")
     lines = [_lines(text) for text in texts]
-    with_more = _judge(root, [line for of_picture in lines for line in of_picture], shape[0] > 0)
+    rows = {place: row[1:] for part in lines for place, _, row in part if len(row) > 4}
+    check_shares(rows)
+    check_form(root, MIDDLE, [row[:4] for row in rows.values() if len(row) == 4 or shape[0]])
+    more = set() if shape[0] else boxes_with_more(rows)
+    raw = [
+        [(place, line, row[:0] if place in more else row) for place, line, row in part]
+        for part in lines
+    ]
     calibration = calibration_in(root)
     return LabelledPictures(
-        root, [str(Path(file).relative_to(root)) for file in pictures.values()], lines,
-        partial(_labels, classes=len(names), shape=shape, with_more=with_more),
+        root, [str(Path(file).relative_to(root)) for file in pictures.values()], raw,
+        partial(_labels, classes=len(names), shape=shape),
         [{"id": k, "name": name} for k, name in enumerate(names)],
         lenses=Calibrations(calibration, root) if calibration else None,
         wrong=_without_picture(root, texts),
@@ -247,21 +254,21 @@ def _write_list(
     return [f"{root / name} lists pictures that are not in {root}, {some(lost)}"] if lost else []
 
 
-def _lines(text: Path) -> list[tuple[str, str]]:
-    """The lines of a text, if it is there: their places in words, and their content."""
+def _lines(text: Path) -> list[tuple[str, str, np.ndarray]]:
+    """The lines of a text, if it is there: their places in words, what they hold, and its numbers,
+    none if they are no numbers."""
+    lines = []
     try:
-        lines = read_text(text).splitlines() if text.is_file() else []
+        content = read_text(text).splitlines() if text.is_file() else []
     except ValueError as error:
-        return [(f"{error}:", "")]
-    return [(f"{text}, line {k}", line.strip()) for k, line in enumerate(lines, 1) if line.strip()]
-
-
-def _numbers(line: str) -> np.ndarray:
-    """The numbers of a line, of which the first is the class; none if it holds something else."""
-    try:
-        return np.array(line.split(), float)
-    except ValueError:
-        return np.zeros(0)
+        return [(f"{error}:", "", np.zeros(0))]
+    for number, line in enumerate(map(str.strip, content), 1):
+        try:
+            row = np.array(line.split(), float)
+        except ValueError:
+            row = np.zeros(0)
+        lines += [(f"{text}, line {number}", line, row)] * bool(line)
+    return lines
 
 
 def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
@@ -274,51 +281,36 @@ def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
         f"{text} has {count} labels, but no picture that is read has its name"
         for text in alone
         if text.suffix == ".txt" and (text.parent in folders or not roots.isdisjoint(text.parents))
-        if (count := sum(len(_numbers(line)) > 4 for _, line in _lines(text)))
+        if (count := sum(len(row) > 4 for *_, row in _lines(text)))
     ]  # fmt: skip
 
 
-def _judge(root: Path, lines: Sequence[tuple[str, str]], has_keypoints: bool) -> frozenset[str]:
-    """The places of lines that are boxes with more numbers. ValueError if the lines of all texts
-    are in another unit or order than YOLO's."""
-    rows = [(place, row[1:]) for place, line in lines if len(row := _numbers(line)) > 4]
-    check_shares(rows)
-    check_form(root, MIDDLE, [row[:4] for _, row in rows if len(row) == 4 or has_keypoints])
-    outlines = (
-        [] if has_keypoints else [(p, row) for p, row in rows if len(row) > 5 and len(row) % 2 == 0]
-    )
-    return frozenset(boxes_with_more(outlines))
-
-
 def _labels(
-    lines: Sequence[tuple[str, str]], size: Size, classes: int, shape: Sequence[int],
-    with_more: Collection[str],
-) -> tuple[Labels, list[str]]:  # fmt: skip
+    lines: Sequence[tuple[str, str, np.ndarray]], size: Size, classes: int, shape: Sequence[int]
+) -> tuple[Labels, list[str]]:
     instances, wrong = [], []
-    for place, line in lines:
+    for place, line, row in lines:
         try:
-            if place in with_more:
-                raise ValueError(
-                    "looks like a box with more numbers, such as a score and a track: keep the box"
-                    ", or tell the keypoints by kpt_shape in data.yaml"
-                )
-            instances.append(_instance(_numbers(line), np.array(size[::-1]), classes, *shape))
+            instances.append(_instance(row, size, classes, *shape))
         except ValueError as error:
             wrong.append(f"{place} {error}, got {line[:80]!r}")
     return Labels(Instances.joined(instances), size), wrong
 
 
 def _instance(
-    numbers: np.ndarray, sides: np.ndarray, classes: int, count: int, per_keypoint: int
+    row: np.ndarray, size: Size, classes: int, count: int, per_keypoint: int
 ) -> Instances:
-    category, numbers = numbers[0] if len(numbers) else -1.0, numbers[1:]
-    keypoints, more = None, count * per_keypoint
+    category, numbers = row[0] if len(row) else -1.0, row[1:]
+    keypoints, more, sides = None, count * per_keypoint, np.array(size[::-1])
     is_form = len(numbers) == 4 + more if more else len(numbers) in range(6, 2**31, 2)
-    if not (category in range(classes) and np.isfinite(numbers).all()) or not (
+    if not (category in range(classes) and np.isfinite(row).all()) or not (
         is_form or len(numbers) == 4
     ):
         others = f"{more} of keypoints, by kpt_shape" if more else "pairs of an outline"
-        raise ValueError(f"must be a class below {classes} and 4 numbers of a box, or {others}")
+        raise ValueError(
+            f"must be a class below {classes} and 4 numbers of a box, or {others}, without a score "
+            "or a track"
+        )
     if len(numbers) == 4 + more > 4:
         keypoints = numbers[4:].reshape(-1, per_keypoint)
         numbers = numbers[:4]
@@ -331,7 +323,8 @@ def _instance(
         box = box_of([table])
     if not (box[:2] < box[2:]).all():
         raise ValueError("must have an area")
-    check_place("shares of the sides of the picture", sides, box, [table], keypoints)
-    has_outline = len(table) > 2 and area_of(table) > NO_AREA
-    outline = [table] if has_outline else ()
-    return labelled(int(category), box, outline=outline, keypoints=keypoints)
+    outline = [table] if len(table) > 2 and area_of(table) > NO_AREA else ()
+    return labelled(
+        int(category), box, outline=outline, keypoints=keypoints, size=size,
+        unit="shares of the sides of the picture",
+    )  # fmt: skip

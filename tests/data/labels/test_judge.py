@@ -9,7 +9,7 @@ import pytest
 from helpers import refused
 
 from darswin.data.labels import read_coco, read_yolo
-from darswin.data.labels.judge import _CORNERS_OF, CORNERS, MIDDLE, SIDES, check_form
+from darswin.data.labels.judge import CORNERS, MIDDLE, SIDES, check_form
 
 PART = "within the first pixel, so they look like shares"
 LOW = np.array([[120, 75], [140, 90], [160, 105]])
@@ -39,18 +39,19 @@ COCO = {
     "only beyond": (boxes([[300, 10, 40, 20], [290, 10, 50, 20], [280, 9, 60, 20]]), None),
 }  # fmt: skip
 TRIANGLES = ["0 .1 .1 .5 .1 .5 .9", "0 .2 .1 .5 .1 .5 .9", "0 0 0 1 0 0 1", "0 .5 .5 .2 .2 .9 1"]
+TRACK = "line 1 must be a class below 1 and 4 numbers .*, without a score or a track"
 POINT = ["0 .5 .5 .2 .2 .4 .5 2"]
 YOLO = {
     "per cent": (["0 50 50 20 20"], {}, r"a\.txt, line 1 has numbers that look like per cent or p"),
     "an outline in per cent": (["0 40 40 60 40 60 60 40 60"], {}, "look like per cent or pixels"),
     "pixels": (["0 132 24 10 12", "0 1 1 1 1", "0 40 40 60 60 50 20"], {}, "like pixels, as 2 of"),
     "corners": ([f"0 .{x} .{x} .9{x}1 .9" for x in (1, 2, 3)], {}, f"look like {CORNERS}"),
-    "tracks": (["0 .5 .5 .2 .2 .91 7", "0 .1 .1 .1 .1 .9 8"], {}, "line 1 looks like a box with"),
-    "tracks and scores": (["0 .5 .5 .2 .2 7 .91"], {}, "line 1 looks like a box with more"),
-    "the same track": ([f"0 .5 .5 .2 .{k} .9 1" for k in (1, 2, 3)], {}, "line 1 looks like a box"),
-    "tracks of corners": (["0 .1 .1 .5 .1 .5 .9 .1 .9 .8 2"], {}, "line 1 looks like a box with"),
-    "keypoints without kpt_shape": ([f"{POINT[0]} .6 .7 1"], {}, "line 1 looks like a box with"),
-    "a score": (["0 .5 .5 .2 .2 .9"], {}, "line 1 must be a class below 1 and 4 numbers"),
+    "tracks": (["0 .5 .5 .2 .2 .91 7", "0 .1 .1 .1 .1 .9 8"], {}, TRACK),
+    "tracks and scores": (["0 .5 .5 .2 .2 7 .91"], {}, TRACK),
+    "the same track": ([f"0 .5 .5 .2 .{k} .9 1" for k in (1, 2, 3)], {}, TRACK),
+    "tracks of corners": (["0 .1 .1 .5 .1 .5 .9 .1 .9 .8 2"], {}, TRACK),
+    "keypoints without kpt_shape": ([f"{POINT[0]} .6 .7 1"], {}, TRACK),
+    "a score": (["0 .5 .5 .2 .2 .9"], {}, TRACK),
     "fewer keypoints": (POINT, {"kpt_shape": [2, 3]}, "4 numbers of a box, or 6 of keypoints"),
     "more keypoints": (POINT * 2, {"kpt_shape": [1, 2]}, "4 numbers of a box, or 2 of keypoints"),
     "keypoints of another form": (POINT, {"kpt_shape": [1, 4]}, "kpt_shape is a count, and 2 or 3"),
@@ -97,11 +98,16 @@ def test_texts_of_yolo(tmp_path, name):
 def test_the_form_of_many_boxes(form):
     rng = np.random.default_rng(0)
     middle, half = rng.uniform(0, 1, (2, 300, 2)) * [[[1]], [[0.3]]]
-    corners = np.hstack((middle - half, middle + half))
-    for other, matrix in _CORNERS_OF.items():
-        written = corners.clip(0, 1) @ np.linalg.inv(matrix)
+    low, high = (middle - half).clip(0, 1), (middle + half).clip(0, 1)
+    written = {
+        CORNERS: (low, high),
+        SIDES: (low, high - low),
+        MIDDLE: (low / 2 + high / 2, high - low),
+    }
+    check_form(Path("a"), MIDDLE, np.hstack((middle, 2 * half)))  # some reach beyond the picture
+    for other, boxes in written.items():
         if other == form:
-            check_form(Path("a"), form, written)
-            check_form(Path("a"), form, corners @ np.linalg.inv(matrix))
+            check_form(Path("a"), form, np.hstack(boxes))
         else:
-            refused(f"boxes cannot be .* look like {other}", check_form, Path("a"), form, written)
+            said = f"boxes cannot be .* look like {other}"
+            refused(said, check_form, Path("a"), form, np.hstack(boxes))
