@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from darswin.boxes import Instances
-from darswin.cli.pictures import ByLens, is_below
+from darswin.cli.pictures import ByLens, claim_folder, is_below
 from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, open_labels, write_coco, write_yolo
@@ -27,7 +27,7 @@ from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
-from darswin.utils.files import remove_partial_files, replace_file
+from darswin.utils.files import replace_file
 from darswin.utils.image import (
     BrokenImageError,
     read_header,
@@ -38,7 +38,6 @@ from darswin.utils.image import (
 from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
-from darswin.utils.text import read_json
 from darswin.views import CameraView, PixelView, list_views
 from darswin.views.camera import picture_size
 
@@ -109,7 +108,7 @@ def warp(
         cameras=data.lenses.digest(),
         target=to_dict(view.lens) if isinstance(view, CameraView) else None,
     )  # fmt: skip
-    folder = _claim(out, settings)
+    folder = claim_folder(out, RECORD, settings)
     work = _Work(replace(data, files=(), raw=(), entries=()), view,
                  folder if in_yolo else folder / PICTURES)  # fmt: skip
     warped: list[_Warped] = []
@@ -257,24 +256,6 @@ def _view(
     if lens.image_size is None:
         raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
     return CameraView(to_corners(lens if size is None else lens.in_picture(size)))
-
-
-def _claim(out: str, settings: dict[str, Any]) -> Path:
-    """The folder for the new data set: new, empty, or of the same command before."""
-    folder = Path(out)
-    record = json.loads(json.dumps(settings))
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder, but {out} is a file")
-    if folder.is_dir() and any(folder.iterdir()):
-        before = read_json(folder / RECORD) if (folder / RECORD).is_file() else None
-        if before != record:
-            raise ValueError(
-                f"--out {out} holds other files: give a new or an empty folder, or one of an "
-                "earlier run of the same command with the same calibrations, which then goes on"
-            )
-        remove_partial_files(folder)
-    replace_file(folder / RECORD, json.dumps(record, indent=1, ensure_ascii=False))
-    return folder
 
 
 def _write(

@@ -209,12 +209,9 @@ def _stored_end(path: str | Path) -> float:
     a header has them too."""
     before = os.environ.get(_OPTIONS)
     os.environ[_OPTIONS] = "|".join(filter(None, (before, "ignore_editlist;1")))
-    try:
-        capture = _opened(path)
-    finally:
-        del os.environ[_OPTIONS]
-        os.environ.update({} if before is None else {_OPTIONS: before})
-    time = 0.0
+    capture, time = _opened(path), 0.0
+    del os.environ[_OPTIONS]
+    os.environ.update({} if before is None else {_OPTIONS: before})
     while capture is not None and capture.grab():
         time = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
     return time

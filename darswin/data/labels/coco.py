@@ -334,7 +334,7 @@ def _instance(
     if keypoints is not None:
         keypoints = _numbers("keypoints", keypoints, 3, 0)
         if count and len(keypoints) not in (0, count):
-            raise ValueError(f"has {len(keypoints)} keypoints, but its category has {count}")
+            raise ValueError(f"has {len(keypoints)} keypoints x, y, v, but its category {count}")
     if str(mode := annotation.get("bbox_mode", 1)).split(".")[-1] not in ("1", "XYWH_ABS"):
         raise ValueError(f"has bbox_mode {mode}, but COCO's boxes are {SIDES}, bbox_mode 1")
     is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
@@ -354,8 +354,8 @@ def _instance(
     if not (isinstance(visible, int | float) and 0 <= visible <= 1):
         raise ValueError(f"has visible {visible!r}, which must be a share from 0 to 1")
     return labelled(
-        annotation["category_id"], box, outline=polygons, mask=rle, crowd=is_crowd,
-        visible=visible, keypoints=keypoints, mirror=mirror, entry=entry, size=size,
+        annotation["category_id"], box, size, outline=polygons, mask=rle, crowd=is_crowd,
+        visible=visible, keypoints=keypoints, mirror=mirror, entry=entry,
     )  # fmt: skip
 
 

@@ -37,10 +37,10 @@ class Labels(NamedTuple):
 
 
 def labelled(
-    label: Any, box: np.ndarray, *, outline: Sequence[np.ndarray] = (),
-    mask: Mapping[str, Any] | None = None, keypoints: np.ndarray | None = None,
-    crowd: bool = False, visible: float = 1.0, mirror: Sequence[int] = (),
-    entry: Mapping[str, Any] | None = None, size: Size | None = None, unit: str = "pixels",
+    label: Any, box: np.ndarray, size: Size | None = None, unit: str = "pixels", *,
+    outline: Sequence[np.ndarray] = (), mask: Mapping[str, Any] | None = None,
+    keypoints: np.ndarray | None = None, crowd: bool = False, visible: float = 1.0,
+    mirror: Sequence[int] = (), entry: Mapping[str, Any] | None = None,
 ) -> Instances:  # fmt: skip
     """One instance of a file of labels, K = 1; box: (4 or 5,); keypoints: (P, 3), with COCO's v.
 
@@ -62,11 +62,9 @@ def labelled(
         },
     )  # fmt: skip
     if size is not None:
-        shown = np.zeros((0, 2)) if keypoints is None else keypoints[0, :, :2]
-        first, last, *others = (
-            np.concatenate((instances.upright.reshape(2, 2), *outline, shown)) / size[::-1]
-        )
-        if not ((first < 1) & (last > 0)).all() or (np.abs((first, last, *others)) > _FAR).any():
+        points = () if keypoints is None else keypoints[..., :2]
+        places = np.concatenate((instances.upright.reshape(2, 2), *outline, *points)) / size[::-1]
+        if not ((places[0] < 1) & (places[1] > 0)).all() or (np.abs(places) > _FAR).any():
             raise ValueError(f"must lie in its picture, with numbers that are {unit}")
     return instances
 

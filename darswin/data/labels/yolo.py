@@ -302,10 +302,8 @@ def _instance(
 ) -> Instances:
     category, numbers = row[0] if len(row) else -1.0, row[1:]
     keypoints, more, sides = None, count * per_keypoint, np.array(size[::-1])
-    is_form = len(numbers) == 4 + more if more else len(numbers) in range(6, 2**31, 2)
-    if not (category in range(classes) and np.isfinite(row).all()) or not (
-        is_form or len(numbers) == 4
-    ):
+    counts = (4, 4 + more) if more else (4, *range(6, len(row), 2))
+    if not (category in range(classes) and len(numbers) in counts and np.isfinite(row).all()):
         others = f"{more} of keypoints, by kpt_shape" if more else "pairs of an outline"
         raise ValueError(
             f"must be a class below {classes} and 4 numbers of a box, or {others}, without a score "
@@ -324,7 +322,5 @@ def _instance(
     if not (box[:2] < box[2:]).all():
         raise ValueError("must have an area")
     outline = [table] if len(table) > 2 and area_of(table) > NO_AREA else ()
-    return labelled(
-        int(category), box, outline=outline, keypoints=keypoints, size=size,
-        unit="shares of the sides of the picture",
-    )  # fmt: skip
+    unit = "shares of the sides of the picture"
+    return labelled(int(category), box, size, unit, outline=outline, keypoints=keypoints)

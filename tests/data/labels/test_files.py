@@ -176,7 +176,7 @@ OUTSIDE = "must lie in its picture, with numbers that are pixels"
         (1, dict(segmentation=[[0, 0, 1e9, 0, 1e9, 1e9]]), OUTSIDE),
         (1, dict(keypoints=[9e9, 5, 2] * 3), OUTSIDE),
         (1, dict(keypoints=[5, 5, 130] * 3), "has keypoints whose third number, v, is not 0, 1 or"),
-        (1, dict(keypoints=[5, 5, 6, 4, 1, 7]), "has 2 keypoints, but its category has 3"),
+        (1, dict(keypoints=[5, 5, 6, 4, 1, 7]), "has 2 keypoints x, y, v, but its category 3"),
         (1, dict(keypoints=[1, 2]), "has the keypoints"),
         (2, dict(segmentation={"size": [3, 4], "counts": [12]}), r".*a mask of \[3, 4\] px"),
     ],
