@@ -324,12 +324,8 @@ def _instance(
     if not (width > 0 and height > 0):  # what is there in its place
         box = box_of_mask(mask) if rle is not None else box_of(polygons)
         if np.isnan(box).any():
-            what = (
-                "has no bbox"
-                if "bbox" not in annotation
-                else f"has a bbox of {width:g} × {height:g} px"
-            )
-            raise ValueError(f"{what}, and neither an outline nor a mask with an area")
+            said = annotation.get("bbox", "no bbox")
+            raise ValueError(f"has {said}, and neither an outline nor a mask with an area")
     keypoints = annotation.get("keypoints")
     if keypoints is not None:
         keypoints = _numbers("keypoints", keypoints, 3, 0)

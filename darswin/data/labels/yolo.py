@@ -181,7 +181,7 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
             names = [names[k] for k in range(len(names))]
         content |= {"names": list(map(str, names))}
         content |= {} if shape is None else {"kpt_shape": [int(number) for number in shape[:2]]}
-        if content.get("kpt_shape", [0, 3])[1] not in (2, 3):
+        if (content.get("kpt_shape") or (0, 3))[1] not in (2, 3):
             raise ValueError(f"kpt_shape is a count, and 2 or 3 numbers of each, not {shape}")
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{file} must name the classes 0, 1, … under names: {error}") from error
