@@ -306,17 +306,13 @@ def _write(
     count = sum(len(labels.instances) for _, labels in pictures)
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)
-    listed = f"{folder / LEFT} lists them"
-    if len(left) > large:
-        print(
-            f"{len(left) - large} instances have left the picture, because less than "
-            f"{LEAST_VISIBLE:.0%} of them is visible; {listed}"
-        )
-    if large:
-        print(
-            f"{large} instances are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of "
-            f"them, only several together; {listed}"
-        )
+    share = f"{LEAST_VISIBLE:.0%} of them"
+    for number, what in (
+        (len(left) - large, f"have left the picture, because less than {share} is visible"),
+        (large, f"are too large for the tiles: none shows {share}, only several together"),
+    ):
+        if number:
+            print(f"{number} instances {what}; {folder / LEFT} lists them")
     report: list[str] = []
     for texts, what in (
         (bad, f"{len(bad)} of {len(data)} pictures were left out"),

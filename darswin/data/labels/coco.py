@@ -110,7 +110,7 @@ def _judge(path: Path, entries: Sequence[Mapping], of_picture: Mapping[Any, list
     outlines = (part for outline in parts if isinstance(outline, list) for part in outline)
     check_pixels(path, "boxes", (_table(one.get("bbox"), 4) for one in annotations))
     check_pixels(path, "outlines", (_table(part, 2) for part in outlines))
-    points = (_table(one.get("keypoints"), 3)[:, :2] for one in annotations)
+    points = (_table(points, 3)[:, :2] for one in annotations if (points := one.get("keypoints")))
     check_pixels(path, "keypoints", points)
     rows = [
         _table([*box, one.get("area") or 0, entry.get("width"), entry.get("height")], 7)

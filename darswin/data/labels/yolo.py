@@ -33,7 +33,7 @@ from darswin.data.labels.labels import (
     labelled,
 )
 from darswin.data.scenes.files import calibration_in, pictures_in
-from darswin.data.splits import some
+from darswin.data.splits import read_list, some
 from darswin.utils.files import replace_file
 from darswin.utils.text import read_text
 
@@ -172,8 +172,7 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
             raise FileNotFoundError(f"no data.yaml or classes.txt in {path}")
         file = files[0]
     if file.suffix == ".txt":
-        names = [line.strip() for line in read_text(file).splitlines() if line.strip()]
-        return file.parent, {"names": names}
+        return file.parent, {"names": read_list(file)}
     try:
         content = dict(yaml.safe_load(read_text(file)))
         names, shape = content["names"], content.get("kpt_shape")
@@ -244,7 +243,7 @@ def _write_list(
     """Writes the list of pictures of a split, with the new names; says which lines name none."""
     lines: list[str] = []
     lost: list[str] = []
-    for line in filter(None, map(str.strip, read_text(root / name).splitlines())):
+    for line in read_list(root / name):
         plain = line.replace("\\", "/")
         files = [os.path.relpath(place / plain, root) for place in (root / name / "..", root)]
         new = next((new_names[file] for file in files if file in new_names), None)
