@@ -192,7 +192,7 @@ def claim_folder(out: str | None, record: str, settings: Mapping[str, Any] | Non
         raise ValueError("missing --out: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
+        raise ValueError(f"--out must be a folder, but {out} is a file")
     if not can_write(folder.absolute()):
         raise ValueError(f"--out must be a folder that can be written, got {out}")
     content = json.loads(json.dumps(settings or []))
