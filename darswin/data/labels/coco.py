@@ -61,10 +61,9 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         isinstance(content.get(name), list) for name in ("images", "annotations", "categories")
     ):
         raise ValueError(f'{path} must have the lists "images", "annotations" and "categories"')
-    if any("segments_info" in one for one in content["annotations"] if isinstance(one, Mapping)):
-        raise ValueError(
-            f"{path} is COCO's panoptic file, with segments_info: give that of the instances"
-        )
+    annotations = [entry for entry in content["annotations"] if isinstance(entry, Mapping)]
+    if any("segments_info" in annotation for annotation in annotations):
+        raise ValueError(f"{path} is COCO's panoptic file, with segments_info: give the instances")
     try:
         entries, categories = content["images"], content["categories"]
         files = [os.fspath(entry["file_name"]) for entry in entries]
@@ -106,16 +105,20 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
 def _judge(path: Path, entries: Sequence[Mapping], of_picture: Mapping[Any, list[dict]]) -> None:
     """ValueError if all boxes, outlines or keypoints are no pixels, or if boxes are no sides."""
     annotations = [annotation for group in of_picture.values() for annotation in group]
-    parts = [one.get("segmentation") for one in annotations]
-    outlines = (part for outline in parts if isinstance(outline, list) for part in outline)
-    check_pixels(path, "boxes", (_table(one.get("bbox"), 4) for one in annotations))
+
+    def column(name: str) -> Iterable[Any]:
+        return (annotation[name] for annotation in annotations if annotation.get(name))
+
+    outlines = (
+        part for parts in column("segmentation") if isinstance(parts, list) for part in parts
+    )
+    check_pixels(path, "boxes", (_table(box, 4) for box in column("bbox")))
     check_pixels(path, "outlines", (_table(part, 2) for part in outlines))
-    points = (_table(points, 3)[:, :2] for one in annotations if (points := one.get("keypoints")))
-    check_pixels(path, "keypoints", points)
+    check_pixels(path, "keypoints", (_table(points, 3)[:, :2] for points in column("keypoints")))
     rows = [
-        _table([*box, one.get("area") or 0, entry.get("width"), entry.get("height")], 7)
-        for entry in entries for one in of_picture[entry["id"]]
-        if isinstance(box := one.get("bbox"), list) and not one.get("segmentation")
+        _table([*box, bare.get("area") or 0, entry.get("width"), entry.get("height")], 7)
+        for entry in entries for bare in of_picture[entry["id"]]
+        if isinstance(box := bare.get("bbox"), list) and not bare.get("segmentation")
     ]  # fmt: skip
     table = np.concatenate([np.zeros((0, 7)), *rows])
     table = table[np.isfinite(table).all(1) & (table[:, 5:] > 0).all(1)]

@@ -70,8 +70,10 @@ def check_pixels(path: Path, what: str, rows: Iterable[np.ndarray]) -> None:
 
 def check_shares(rows: Mapping[str, np.ndarray]) -> None:
     """ValueError if most rows, by their places in words, are in another unit than shares."""
-    count = np.count_nonzero
-    far = {p: row.max() for p, row in rows.items() if 2 * count(np.abs(row) > _FAR) >= len(row)}
+    is_far = {place: np.abs(row) > _FAR for place, row in rows.items()}
+    far = {
+        place: rows[place].max() for place in rows if 2 * is_far[place].sum() >= len(rows[place])
+    }
     if len(far) > len(rows) / 2:
         unit = "pixels" if max(far.values()) > 100 else "per cent or pixels"
         raise ValueError(
@@ -90,5 +92,6 @@ def boxes_with_more(rows: Mapping[str, np.ndarray]) -> set[str]:
         whole = (ends % 1 == 0).all(0)
         are_boxes = len(ends) > 2 and 6 in count and not _odd(MIDDLE, ends)[0].any()
         are_all = (ends[:, whole] > 1).any() or (are_boxes and whole[-2:].any())
-        places |= {p for p, row in part.items() if are_all or ((row % 1 == 0) & (row > 1)).any()}
+        is_track = {place: ((row % 1 == 0) & (row > 1)).any() for place, row in part.items()}
+        places |= {place for place in part if are_all or is_track[place]}
     return places

@@ -277,7 +277,7 @@ def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
     roots = {place for place in roots if place.name == "labels"}
     alone = [text for text in map(Path, files_below(root)) if text not in used]
     return [
-        f"{text} has {count} labels, but no picture that is read has its name"
+        f"{text} has {count} labels, but no picture has its name: did a tool change it?"
         for text in alone
         if text.suffix == ".txt" and (text.parent in folders or not roots.isdisjoint(text.parents))
         if (count := sum(len(row) > 4 for *_, row in _lines(text)))
