@@ -6,7 +6,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -16,7 +16,7 @@ import numpy as np
 from darswin.cli.arguments import can_write
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.lens import Lens
-from darswin.utils.files import check_is_file, replace_file
+from darswin.utils.files import check_is_file, remove_partial_files, replace_file
 from darswin.utils.image import BrokenImageError, read_header, read_oriented
 from darswin.utils.parameters import with_flags
 from darswin.utils.video import is_stream, is_video, read_frames, read_stream, stream_name
@@ -185,27 +185,31 @@ def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> d
     return relative | {name: re.sub(r"\W+", "_", name) for name in streams}
 
 
-def claim_folder(out: str | None, record: str) -> Path:
+def claim_folder(out: str | None, record: str, settings: Mapping[str, Any] | None = None) -> Path:
     """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
-    which left the file `record` there."""
+    which left the file `record` there; with settings, which a run keeps there, of the same ones."""
     if out is None:
         raise ValueError("missing --out: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
+        raise ValueError(f"--out must be a folder, but {out} is a file")
     if not can_write(folder.absolute()):
         raise ValueError(f"--out must be a folder that can be written, got {out}")
-    if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
+    content = json.loads(json.dumps(settings or []))
+    try:
+        before = json.loads((folder / record).read_bytes())
+    except (OSError, ValueError):
+        before = None
+    is_ours = before == content if settings else isinstance(before, list)
+    if folder.is_dir() and not is_ours and any(folder.iterdir()):
+        end = (
+            "with the same calibrations, which then goes on" if settings else "to replace its files"
+        )
         raise ValueError(
             f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "
-            "run of this command, whose files are replaced"
+            f"run of the same command {end}"
         )
-    replace_file(folder / record, "[]")
+    if is_ours:
+        remove_partial_files(folder)
+    replace_file(folder / record, json.dumps(content, indent=1, ensure_ascii=False))
     return folder
-
-
-def _is_ours(file: Path) -> bool:
-    try:
-        return isinstance(json.loads(file.read_bytes()), list)
-    except (OSError, ValueError):
-        return False

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from darswin.boxes import Instances
-from darswin.cli.pictures import ByLens, is_below
+from darswin.cli.pictures import ByLens, claim_folder, is_below
 from darswin.cli.views import named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, open_labels, write_coco, write_yolo
@@ -27,7 +27,7 @@ from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.opencv import Coefficients
-from darswin.utils.files import remove_partial_files, replace_file
+from darswin.utils.files import replace_file
 from darswin.utils.image import (
     BrokenImageError,
     read_header,
@@ -38,7 +38,6 @@ from darswin.utils.image import (
 from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
-from darswin.utils.text import read_json
 from darswin.views import CameraView, PixelView, list_views
 from darswin.views.camera import picture_size
 
@@ -109,7 +108,7 @@ def warp(
         cameras=data.lenses.digest(),
         target=to_dict(view.lens) if isinstance(view, CameraView) else None,
     )  # fmt: skip
-    folder = _claim(out, settings)
+    folder = claim_folder(out, RECORD, settings)
     work = _Work(replace(data, files=(), raw=(), entries=()), view,
                  folder if in_yolo else folder / PICTURES)  # fmt: skip
     warped: list[_Warped] = []
@@ -259,24 +258,6 @@ def _view(
     return CameraView(to_corners(lens if size is None else lens.in_picture(size)))
 
 
-def _claim(out: str, settings: dict[str, Any]) -> Path:
-    """The folder for the new data set: new, empty, or of the same command before."""
-    folder = Path(out)
-    record = json.loads(json.dumps(settings))
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder, but {out} is a file")
-    if folder.is_dir() and any(folder.iterdir()):
-        before = read_json(folder / RECORD) if (folder / RECORD).is_file() else None
-        if before != record:
-            raise ValueError(
-                f"--out {out} holds other files: give a new or an empty folder, or one of an "
-                "earlier run of the same command with the same calibrations, which then goes on"
-            )
-        remove_partial_files(folder)
-    replace_file(folder / RECORD, json.dumps(record, indent=1, ensure_ascii=False))
-    return folder
-
-
 def _write(
     folder: Path, data: LabelledPictures, view: PixelView, warped: Sequence[_Warped],
     settings: Mapping[str, Any],
@@ -293,11 +274,12 @@ def _write(
             os.path.normpath(name): [file for file, _ in new.pictures]
             for name, new in zip(data.files, warped, strict=True)
         }
-        said, missing = moved_splits(Path(settings["yolo"]), folder, new_names)
+        said, missing, lost = moved_splits(Path(settings["yolo"]), folder, new_names)
         write_yolo(folder, pictures, data.categories, said)
         for split in missing:
             print(f"left out of data.yaml, because it is not in {data.folder}: {split}")
     else:
+        lost = []
         write_coco(folder / COCO, pictures, data.categories)
     if isinstance(view, CameraView):
         save(view.lens, folder / LENS)
@@ -320,21 +302,17 @@ def _write(
     ]  # fmt: skip
     replace_file(folder / LEFT, json.dumps(left, indent=1, ensure_ascii=False))
     bad = [new.error for new in warped if new.error]
-    wrong = [*data.wrong, *(text for new in warped for text in new.wrong)]
+    wrong = [*data.wrong, *lost, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)
-    listed = f"{folder / LEFT} lists them"
-    if len(left) > large:
-        print(
-            f"{len(left) - large} instances have left the picture, because less than "
-            f"{LEAST_VISIBLE:.0%} of them is visible; {listed}"
-        )
-    if large:
-        print(
-            f"{large} instances are too large for the tiles: none shows {LEAST_VISIBLE:.0%} of "
-            f"them, only several together; {listed}"
-        )
+    share = f"{LEAST_VISIBLE:.0%} of them"
+    for number, what in (
+        (len(left) - large, f"have left the picture, because less than {share} is visible"),
+        (large, f"are too large for the tiles: none shows {share}, only several together"),
+    ):
+        if number:
+            print(f"{number} instances {what}; {folder / LEFT} lists them")
     report: list[str] = []
     for texts, what in (
         (bad, f"{len(bad)} of {len(data)} pictures were left out"),

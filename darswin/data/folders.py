@@ -25,13 +25,13 @@ from darswin.utils.parameters import naming
 from darswin.utils.video import SUFFIXES as VIDEOS
 
 SUFFIXES = frozenset((
-    ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".dib", ".webp", ".tif", ".tiff", ".ppm",
-    ".pgm", ".pbm", ".pnm",
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".insp", ".mpo", ".jps", ".png", ".bmp", ".dib", ".webp",
+    ".tif", ".tiff", ".ppm", ".pgm", ".pbm", ".pnm",
 ))  # fmt: skip
 # Formats that OpenCV reads only in some builds, or not at all.
 OTHER_SUFFIXES = frozenset((
     ".gif", ".heic", ".heif", ".avif", ".jp2", ".j2k", ".jxl", ".psd", ".svg", ".tga", ".exr",
-    ".hdr", ".dng", ".cr2", ".nef", ".arw",
+    ".hdr", ".dng", ".gpr", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2",
 ))  # fmt: skip
 PICTURES = SUFFIXES | OTHER_SUFFIXES
 LOOKED_FOR = (

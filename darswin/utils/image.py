@@ -17,7 +17,8 @@ from darswin.utils.files import check_is_file, replace_file
 WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_LAST = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # what complete files have at their ends
+# At the ends of complete files.
+_LAST = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9", "MPO": b"\xff\xd9"}
 _END = 1024  # bytes, because some programs write more behind it
 _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
 

@@ -17,8 +17,9 @@ import numpy as np
 from darswin.utils.image import BrokenImageError
 
 SUFFIXES = frozenset((
-    ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".m2ts", ".m4v", ".mjpeg", ".mjpg",
-    ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
+    ".360", ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".insv", ".lrv", ".m2ts",
+    ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".osv",
+    ".ts", ".webm", ".wmv", ".y4m",
 ))  # fmt: skip
 WRITTEN = frozenset((".avi", ".m4v", ".mkv", ".mov", ".mp4"))
 # The EXIF orientations for the turns in a video's metadata, in degrees clockwise.
@@ -28,6 +29,7 @@ _ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
 _TOLERANCE = 0.5
 _PART = 0.05
 _STREAM = re.compile(r"\d{1,3}|/dev/video\d+|[A-Za-z][\w+.-]*://.+")
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _PATIENCE = 2.0  # s, in which a stream may answer when it is left
 
 
@@ -194,8 +196,22 @@ def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: fl
         return
     # Times rather than counts: for some files OpenCV makes the count from the length.
     length, end = named / rate, time + 1 / rate
-    if length - end > min(_TOLERANCE, _PART * length):
+    last = length - min(_TOLERANCE, _PART * length)
+    if end < last and _stored_end(path) + 1 / rate < last:
         raise BrokenImageError(
             f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s; its "
             f"header claims {length:.1f} s"
         )
+
+
+def _stored_end(path: str | Path) -> float:
+    """The time of the last frame of a video, s, with those that its edit list hides: the count of
+    a header has them too."""
+    before = os.environ.get(_OPTIONS)
+    os.environ[_OPTIONS] = "|".join(filter(None, (before, "ignore_editlist;1")))
+    capture, time = _opened(path), 0.0
+    del os.environ[_OPTIONS]
+    os.environ.update({} if before is None else {_OPTIONS: before})
+    while capture is not None and capture.grab():
+        time = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    return time

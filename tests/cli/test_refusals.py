@@ -68,7 +68,7 @@ REFUSED = {
         --network n.onnx --fov_deg wide => --fov_deg must be a number, got wide
     """,
     "predict p.png --lens lens.json --out new --network": r"""
-        n.onnx --out even.png => --out must be a folder for the pictures, but even.png is a file
+        n.onnx --out even.png => --out must be a folder, but even.png is a file
         n.onnx --view fish => --view must be one of .*, mercator, .* got fish
         n.onnx --view polar => --view polar shows no picture to a network
         n.onnx --view mercator:3 => 'mercator' has no option 'count'; it has fov,

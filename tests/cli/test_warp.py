@@ -342,7 +342,7 @@ LAYOUTS = {
     "images/train": ("images/train", "images/val",
                      {"train": "images/train", "val": ["images/val"], "test": "images/test"}),
     "train/images": ("train/images", "valid/images",
-                     {"train": "../train/images", "val": "../valid/images"}),
+                     {"train": "..\\train\\images", "val": "../valid/images"}),
     "lists": ("images/train", "images/val",
               {"path": "../in", "train": "train.txt", "val": "sub/val.txt"}),
     "only names": ("images/train", "images/val", {}),
@@ -361,8 +361,8 @@ def test_the_splits_of_yolo_stay_apart(layout, capsys):
             parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(root / file), np.zeros((60, 80, 3), np.uint8))
         text.write_text("0 0.5 0.5 0.3 0.3\n")
-    (root / "train.txt").write_text(f"./{files[0]}\n")
-    (root / "sub/val.txt").write_text(f"{root.absolute() / files[1]}\nnowhere.png\n")
+    (root / "train.txt").write_text(f"./{files[0]}\r\n".replace("/", "\\"))
+    (root / "sub/val.txt").write_text(f"{root.absolute() / files[1]}\n\n")
     (root / "data.yaml").write_text(yaml.safe_dump(splits | content))
     warp(root / "data.yaml", "tiles:4", "--size 32,32")
     found = yaml.safe_load((out / "data.yaml").read_text())
@@ -370,12 +370,32 @@ def test_the_splits_of_yolo_stay_apart(layout, capsys):
     assert ("left out of data.yaml" in capsys.readouterr().out) == ("test" in splits)
     want = {name: value for name, value in splits.items() if name not in ("path", "test")}
     if layout == "train/images":
-        want = {name: value.removeprefix("../") for name, value in want.items()}
+        want = {"train": "train/images", "val": "valid/images"}
     assert {name: found[name] for name in ("train", "val", "test") if name in found} == want
     assert len(list(out.rglob("a_?.png"))) == len(list(out.rglob("b_?.txt"))) == 4
     if layout == "lists":
         names = [f"./images/val/b_{k}.png" for k in range(4)]
         assert (out / "sub/val.txt").read_text().split() == names
+
+
+def test_what_yolo_lists_in_vain_is_named(capsys):
+    """Lines of another machine, texts without a picture, and keypoints that kpt_shape has not."""
+    for folder in ("images", "labels"):
+        Path("in", folder).mkdir(parents=True)
+    for name in ("a", "b#1"):
+        cv2.imwrite(f"in/images/{name}.png", np.zeros((60, 80, 3), np.uint8))
+    Path("in/labels/a.txt").write_text("0 .5 .5 .3 .3 .5 .5 2\n0 .5 .5 .3 .3 .5 .5 2 .4 .4 2")
+    Path("in/labels/b_1.txt").write_text("0 .5 .5 .3 .3 .5 .5 2")
+    Path("in/labels/notes.txt").write_text("0 of 5")
+    Path("in/train.txt").write_text("C:\\set\\images\\a.png\nimages/a.png\n")
+    shape = {"kpt_shape": [2, 3], "names": ["hand"]}
+    Path("in/data.yaml").write_text(yaml.safe_dump(shape | {"train": "train.txt"}))
+    said = refused(capsys, "in", WIDE)
+    for words in ("3 pictures", "a.txt, line 1 must be", "b_1.txt has 1 labels", "not in in, ['C:"):
+        assert words in said
+    assert Path("out/train.txt").read_text() == "./images/a.png\n"
+    assert yaml.safe_load(Path("out/data.yaml").read_text())["kpt_shape"] == [2, 3]
+    assert len(Path("out/labels/a.txt").read_text().splitlines()) == 1
 
 
 def test_two_pictures_never_become_one(capsys):

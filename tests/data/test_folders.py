@@ -164,8 +164,9 @@ def test_links_are_followed_once(tmp_path, monkeypatch):
 
 
 def test_pictures_and_videos_below_a_folder(tmp_path):
-    touch(tmp_path, "b/10.png", "b/2.png", "a/2.MP4", "3.txt", ".x/4.jpg", "c/5.heic")
-    found = [str(tmp_path / name) for name in ("a/2.MP4", "b/10.png", "b/2.png")]
+    names = ("a/2.MP4", "a/3.insv", "a/4.360", "b/10.png", "b/2.png", "b/5.insp", "b/6.mpo")
+    touch(tmp_path, *names, "3.txt", ".x/4.jpg", "c/5.heic")
+    found = [str(tmp_path / name) for name in names]
     with pytest.warns(LeftOut, match=r"does not read, 1 \.heic, e\.g\. .*c/5\.heic"):
         assert pictures_and_videos_below(tmp_path) == found
     for folder, said in ((".x/y", r"in .*\.x/y$"), ("c", r"in .*c, but 1 \.heic, which")):

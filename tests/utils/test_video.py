@@ -1,5 +1,6 @@
 """Frames of video files, against what was written into them and what OpenCV itself reads."""
 
+import struct
 import time
 
 import cv2
@@ -58,6 +59,18 @@ def test_a_video_that_is_cut_off(tmp_path, name, part):
         for frame in read_frames(path):
             numbers.append(frame.number)
     assert numbers == list(range(len(numbers))) and 0.4 * part < len(numbers) / 40 < part + 0.1
+
+
+def test_frames_that_an_edit_list_hides_are_not_missing(tmp_path, monkeypatch):
+    monkeypatch.setenv(video._OPTIONS, "threads;1")
+    path = tmp_path / "a.mp4"
+    write_video(path, 40)
+    content = bytearray(path.read_bytes())
+    place = content.index(b"elst") + 12  # ISO/IEC 14496-12, 8.6.6: 1 s in ms, from 3 s on
+    struct.pack_into(">Ii", content, place, 1000, 3 * 10240)
+    path.write_bytes(content)
+    assert len(list(read_frames(path))) == 10
+    assert video.os.environ[video._OPTIONS] == "threads;1"
 
 
 def test_what_is_no_video(tmp_path):

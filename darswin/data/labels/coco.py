@@ -24,6 +24,7 @@ from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask
 from darswin.boxes.turned import as_turned
 from darswin.data.cameras import Calibrations
+from darswin.data.labels.judge import SIDES, check_form, check_pixels
 from darswin.data.labels.labels import (
     LabelledPictures,
     Labels,
@@ -42,7 +43,6 @@ _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "
 _DIGITS = 3  # after the point, in pixels
 _SHARE_DIGITS = 4  # of scores, visible shares and degrees
 _SAME = 0.1  # px, of corners that are rounded
-_FAR = 100  # times the longer side of a picture: no instance reaches that far
 
 
 def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledPictures:
@@ -62,18 +62,22 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         isinstance(content.get(name), list) for name in ("images", "annotations", "categories")
     ):
         raise ValueError(f'{path} must have the lists "images", "annotations" and "categories"')
+    annotations = [entry for entry in content["annotations"] if isinstance(entry, Mapping)]
+    if any("segments_info" in annotation for annotation in annotations):
+        raise ValueError(f"{path} is COCO's panoptic file, with segments_info: give the instances")
     try:
         entries, categories = content["images"], content["categories"]
         files = [os.fspath(entry["file_name"]) for entry in entries]
         of_picture: dict[Any, list[dict]] = {entry["id"]: [] for entry in entries}
-        mirrors = {
-            category["id"]: _mirror(category.get("keypoints") or ()) for category in categories
+        points = {
+            category["id"]: (len(names := category.get("keypoints") or ()), _mirror(names))
+            for category in categories
         }
         if nameless := [category for category in categories if "name" not in category]:
             raise ValueError(f"{path}: a category must have a name, got {nameless[0]}")
         wrong = [
             f"{path}: {said}" for annotation in content["annotations"]
-            if (said := _placed(annotation, of_picture, mirrors))
+            if (said := _placed(annotation, of_picture, points))
         ]  # fmt: skip
     except KeyError as error:
         raise ValueError(f"{path} is not in COCO's form: it lacks {error}") from error
@@ -81,6 +85,7 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         raise ValueError(f"{path} is not in COCO's form: {error}") from error
     if len(of_picture) < len(entries) or len(set(files)) < len(files):
         raise ValueError(f"{path} lists a picture twice")
+    _judge(path, entries, of_picture)
     folder = Path(pictures) if pictures is not None else _folder(path, files)
     there = [(folder / file).is_file() for file in files]
     if missing := [file for file, is_there in zip(files, there, strict=True) if not is_there]:
@@ -93,9 +98,33 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
     return LabelledPictures(
         folder, list(compress(files, there)),
         [(entry, of_picture[entry["id"]]) for entry in entries],
-        partial(_labels, path=str(path), mirrors=mirrors), categories, entries,
+        partial(_labels, path=str(path), points=points), categories, entries,
         Calibrations(calibration, folder) if calibration else None, wrong,
     )  # fmt: skip
+
+
+def _judge(path: Path, entries: Sequence[Mapping], of_picture: Mapping[Any, list[dict]]) -> None:
+    """ValueError if all boxes, outlines or keypoints are no pixels, or if boxes are no sides."""
+    annotations = [annotation for group in of_picture.values() for annotation in group]
+
+    def column(name: str) -> Iterable[Any]:
+        return (annotation[name] for annotation in annotations if annotation.get(name))
+
+    outlines = (
+        part for parts in column("segmentation") if isinstance(parts, list) for part in parts
+    )
+    check_pixels(path, "boxes", (_table(box, 4) for box in column("bbox")))
+    check_pixels(path, "outlines", (_table(part, 2) for part in outlines))
+    check_pixels(path, "keypoints", (_table(points, 3)[:, :2] for points in column("keypoints")))
+    rows = [
+        _table([*box, bare.get("area") or 0, entry.get("width"), entry.get("height")], 7)
+        for entry in entries for bare in of_picture[entry["id"]]
+        if isinstance(box := bare.get("bbox"), list) and not bare.get("segmentation")
+    ]  # fmt: skip
+    table = np.concatenate([np.zeros((0, 7)), *rows])
+    table = table[np.isfinite(table).all(1) & (table[:, 5:] > 0).all(1)]
+    boxes, areas, sides = np.split(table, [4, 5], 1)
+    check_form(path, SIDES, boxes / np.tile(sides, 2), areas[:, 0] / sides.prod(1))
 
 
 def coco_files(folder: Path) -> list[Path]:
@@ -230,7 +259,7 @@ def _folder(path: Path, files: Sequence[str]) -> Path:
 
 
 def _labels(
-    raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, mirrors: Mapping
+    raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, points: Mapping
 ) -> tuple[Labels, list[str]]:
     entry, annotations = raw
     said = tuple(map(_side, (entry.get("height"), entry.get("width"))))
@@ -243,7 +272,7 @@ def _labels(
     instances, wrong = [], []
     for annotation in annotations:
         try:
-            instances.append(_instance(annotation, mirrors, size))
+            instances.append(_instance(annotation, size, *points[annotation["category_id"]]))
         except ValueError as error:
             wrong.append(f"{path}: the annotation {annotation.get('id')} {error}")
     return Labels(Instances.joined(instances), size), wrong
@@ -257,11 +286,16 @@ def _side(side: Any) -> Any:
         return side
 
 
-def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+def _table(values: Any, group: int) -> np.ndarray:
+    """The numbers that a file has, in rows; one row of NaN for what is no such table."""
     try:
-        table = np.asarray(values, float).reshape(-1, group)
+        return np.asarray(values, float).reshape(-1, group)
     except (TypeError, ValueError):
-        table = np.full((1, group), math.nan)
+        return np.full((1, group), math.nan)
+
+
+def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
+    table = _table(values, group)
     if len(table) < least or not np.isfinite(table).all():
         raise ValueError(
             f"has the {name} {reprlib.repr(values)}, which must be finite numbers, {group} each"
@@ -269,7 +303,9 @@ def _numbers(name: str, values: Any, group: int, least: int = 1) -> np.ndarray:
     return table
 
 
-def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> Instances:
+def _instance(
+    annotation: Mapping[str, Any], size: Size, count: int, mirror: Sequence[int]
+) -> Instances:
     segments = annotation.get("segmentation") or ()
     polygons, rle, mask = [], None, np.zeros(size, bool)
     if isinstance(segments, Mapping):
@@ -292,18 +328,15 @@ def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> In
     if not (width > 0 and height > 0):  # what is there in its place
         box = box_of_mask(mask) if rle is not None else box_of(polygons)
         if np.isnan(box).any():
-            what = (
-                "has no bbox"
-                if "bbox" not in annotation
-                else f"has a bbox of {width:g} × {height:g} px"
-            )
-            raise ValueError(f"{what}, and neither an outline nor a mask with an area")
-    limit = _FAR * max(size)
-    if any((np.abs(points) > limit).any() for points in (box, *polygons)):
-        raise ValueError(
-            f"has a box or polygon that reaches farther than {limit} px from its picture of "
-            f"{size[1]} × {size[0]} px"
-        )
+            said = annotation.get("bbox", "no bbox")
+            raise ValueError(f"has {said}, and neither an outline nor a mask with an area")
+    keypoints = annotation.get("keypoints")
+    if keypoints is not None:
+        keypoints = _numbers("keypoints", keypoints, 3, 0)
+        if count and len(keypoints) not in (0, count):
+            raise ValueError(f"has {len(keypoints)} keypoints x, y, v, but its category {count}")
+    if str(mode := annotation.get("bbox_mode", 1)).split(".")[-1] not in ("1", "XYWH_ABS"):
+        raise ValueError(f"has bbox_mode {mode}, but COCO's boxes are {SIDES}, bbox_mode 1")
     is_crowd = {"0": False, "1": True}.get(str(_side(annotation.get("iscrowd") or 0)))
     if is_crowd is None:
         raise ValueError(f"has iscrowd {annotation['iscrowd']!r}, which must be 0 or 1")
@@ -317,15 +350,12 @@ def _instance(annotation: Mapping[str, Any], mirrors: Mapping, size: Size) -> In
         if turned is not None:
             box, polygons = turned, []
             entry["attributes"] = {k: v for k, v in attributes.items() if k != "rotation"}
-    keypoints = annotation.get("keypoints")
     visible = annotation.get("visible", 1.0)
     if not (isinstance(visible, int | float) and 0 <= visible <= 1):
         raise ValueError(f"has visible {visible!r}, which must be a share from 0 to 1")
-    label = annotation["category_id"]
     return labelled(
-        label, box, outline=polygons, mask=rle, crowd=is_crowd, visible=visible,
-        keypoints=None if keypoints is None else _numbers("keypoints", keypoints, 3, 0),
-        mirror=mirrors[label], entry=entry,
+        annotation["category_id"], box, size, outline=polygons, mask=rle, crowd=is_crowd,
+        visible=visible, keypoints=keypoints, mirror=mirror, entry=entry,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ Size = tuple[int, int]
 # An instance of which a smaller share is visible in the new picture is left out. The share counts
 # from the picture that people labelled, so it adds up over several moves.
 LEAST_VISIBLE = 0.2
+_FAR = 3.0  # times a side of the picture: nothing reaches that far
 
 
 class Labels(NamedTuple):
@@ -36,17 +37,23 @@ class Labels(NamedTuple):
 
 
 def labelled(
-    label: Any, box: np.ndarray, *, outline: Sequence[np.ndarray] = (),
-    mask: Mapping[str, Any] | None = None, keypoints: np.ndarray | None = None,
-    crowd: bool = False, visible: float = 1.0, mirror: Sequence[int] = (),
-    entry: Mapping[str, Any] | None = None,
+    label: Any, box: np.ndarray, size: Size | None = None, unit: str = "pixels", *,
+    outline: Sequence[np.ndarray] = (), mask: Mapping[str, Any] | None = None,
+    keypoints: np.ndarray | None = None, crowd: bool = False, visible: float = 1.0,
+    mirror: Sequence[int] = (), entry: Mapping[str, Any] | None = None,
 ) -> Instances:  # fmt: skip
-    """One instance of a file of labels, K = 1; box: (4 or 5,); keypoints: (P, 3), with COCO's v."""
+    """One instance of a file of labels, K = 1; box: (4 or 5,); keypoints: (P, 3), with COCO's v.
+
+    ValueError for another v; or, with the size of its picture, if it lies outside, or far from it:
+    then its numbers are not of the unit.
+    """
     if keypoints is not None:
+        if not ((keypoints[:, 2] >= 0) & (keypoints[:, 2] <= 2)).all():
+            raise ValueError("has keypoints whose third number, v, is not 0, 1 or 2")
         keypoints = keypoints.copy()[None]
         keypoints[keypoints[..., 2] == 0, :2] = np.nan
     is_int = isinstance(label, int) and abs(label) < 2**63
-    return Instances(
+    instances = Instances(
         box[None], labels=np.array([label], int if is_int else object),
         keypoints=keypoints, masks=[mask], outlines=[outline],
         more={
@@ -54,6 +61,12 @@ def labelled(
             "entry": [entry or {}],
         },
     )  # fmt: skip
+    if size is not None:
+        points = () if keypoints is None else keypoints[..., :2]
+        places = np.concatenate((instances.upright.reshape(2, 2), *outline, *points)) / size[::-1]
+        if not ((places[0] < 1) & (places[1] > 0)).all() or (np.abs(places) > _FAR).any():
+            raise ValueError(f"must lie in its picture, with numbers that are {unit}")
+    return instances
 
 
 def known_keypoints(instances: Instances, row: int) -> np.ndarray:

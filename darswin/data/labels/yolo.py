@@ -22,6 +22,8 @@ import yaml
 from darswin.boxes import Instances, corners, decode_rle
 from darswin.boxes.regions import NO_AREA, area_of, box_of
 from darswin.data.cameras import Calibrations
+from darswin.data.folders import files_below
+from darswin.data.labels.judge import MIDDLE, boxes_with_more, check_form, check_shares
 from darswin.data.labels.labels import (
     LabelledPictures,
     Labels,
@@ -31,11 +33,11 @@ from darswin.data.labels.labels import (
     labelled,
 )
 from darswin.data.scenes.files import calibration_in, pictures_in
+from darswin.data.splits import read_list, some
 from darswin.utils.files import replace_file
 from darswin.utils.text import read_text
 
 _SPLITS = ("train", "val", "test")
-_FAR = 100  # a share of a side that no instance reaches
 _NAMES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt")
 
 
@@ -51,20 +53,31 @@ def read_yolo(path: str | Path) -> LabelledPictures:
 
     Raises:
         FileNotFoundError: no classes, no pictures, or no labels.
-        ValueError: from `labels(k)`, a line of another form; it names the file.
+        ValueError: lines that together are in another unit or order; or from `labels(k)`, one of
+            another form. It names the file. Texts without a picture are named in `wrong`.
     """
     root, content = _content(Path(path))
-    names, per_keypoint = content["names"], (content.get("kpt_shape") or (0, 0))[1]
+    names, shape = content["names"], content.get("kpt_shape") or (0, 0)
     pictures = pictures_in(root)
-    texts = [str(_text_of(root, Path(stem))) for stem in pictures]
-    if not any(Path(text).is_file() for text in texts):
+    texts = [_text_of(root, Path(stem)) for stem in pictures]
+    if not any(text.is_file() for text in texts):
         raise FileNotFoundError(f"no labels in {root}: the first would be {texts[0]}")
+    lines = [_lines(text) for text in texts]
+    rows = {place: row[1:] for part in lines for place, _, row in part if len(row) > 4}
+    check_shares(rows)
+    check_form(root, MIDDLE, [row[:4] for row in rows.values() if len(row) == 4 or shape[0]])
+    more = set() if shape[0] else boxes_with_more(rows)
+    raw = [
+        [(place, line, row[:0] if place in more else row) for place, line, row in part]
+        for part in lines
+    ]
     calibration = calibration_in(root)
     return LabelledPictures(
-        root, [str(Path(file).relative_to(root)) for file in pictures.values()], texts,
-        partial(_labels, classes=len(names), per_keypoint=per_keypoint),
+        root, [str(Path(file).relative_to(root)) for file in pictures.values()], raw,
+        partial(_labels, classes=len(names), shape=shape),
         [{"id": k, "name": name} for k, name in enumerate(names)],
         lenses=Calibrations(calibration, root) if calibration else None,
+        wrong=_without_picture(root, texts),
     )  # fmt: skip
 
 
@@ -83,20 +96,20 @@ def write_yolo(
         more: other entries of `data.yaml`, such as the splits.
     """
     number = {category["id"]: k for k, category in enumerate(categories)}
-    shape = None
+    shape = list((more or {}).get("kpt_shape") or (0, 3))
     for entry, labels in pictures:
         instances = labels.instances
         if "crowd" in instances.more:
             instances = instances[~instances.more["crowd"]]
         if instances.keypoints is not None and len(instances):
-            shape = [max(instances.keypoints.shape[1], shape[0] if shape else 0), 3]
+            shape = [max(instances.keypoints.shape[1], shape[0]), 3]
         classes = [number[label] for label in check_labels(instances, number)]
         lines = yolo_lines(replace(instances, labels=np.array(classes)), labels.size)
         text = _text_of(Path(root), Path(entry["file_name"]).with_suffix(""))
         replace_file(text, lines)
     names = {k: category["name"] for k, category in enumerate(categories)}
     content = {"path": ".", **(more or {}), "names": names}
-    content |= {} if shape is None else {"kpt_shape": shape}
+    content |= {"kpt_shape": shape} if shape[0] else {}
     replace_file(Path(root) / _NAMES[0], yaml.safe_dump(content, sort_keys=False))
 
 
@@ -159,8 +172,7 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
             raise FileNotFoundError(f"no data.yaml or classes.txt in {path}")
         file = files[0]
     if file.suffix == ".txt":
-        names = [line.strip() for line in read_text(file).splitlines() if line.strip()]
-        return file.parent, {"names": names}
+        return file.parent, {"names": read_list(file)}
     try:
         content = dict(yaml.safe_load(read_text(file)))
         names, shape = content["names"], content.get("kpt_shape")
@@ -168,6 +180,8 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
             names = [names[k] for k in range(len(names))]
         content |= {"names": list(map(str, names))}
         content |= {} if shape is None else {"kpt_shape": [int(number) for number in shape[:2]]}
+        if (content.get("kpt_shape") or (0, 3))[1] not in (2, 3):
+            raise ValueError(f"kpt_shape is a count, and 2 or 3 numbers of each, not {shape}")
     except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{file} must name the classes 0, 1, … under names: {error}") from error
     root = file.parent / str(content.get("path") or ".")
@@ -176,21 +190,21 @@ def _content(path: Path) -> tuple[Path, dict[str, Any]]:
 
 def moved_splits(
     source: Path, folder: Path, new_names: Mapping[str, Sequence[str]]
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[dict[str, Any], list[str], list[str]]:
     """The entries of `data.yaml` for pictures that have moved to another folder.
 
-    The lists of pictures of the splits are written anew.
+    The lists of pictures of the splits are written anew. A backslash may stand for a slash.
 
     Args:
         source: the folder or data.yaml that was read. folder: of the new pictures.
         new_names: the new pictures of each old one, relative to their folders.
 
     Returns:
-        The entries; and the splits that are left out because their pictures are not there, in
-        words.
+        The entries; the splits that are left out because their pictures are not there, in words;
+        and lists that have lines without a picture, in words.
     """
     root, content = _content(source)
-    missing = []
+    missing, wrong = [], []
     for split in _SPLITS:
         if not content.get(split):
             continue
@@ -201,19 +215,19 @@ def moved_splits(
         kept = [place for place in places if place is not None]
         for place in kept:
             if (root / place).is_file():
-                _write_list(root, place, folder, new_names)
+                wrong += _write_list(root, place, folder, new_names)
         content[split] = kept if isinstance(content[split], list) else "".join(kept)
         if not kept:
             del content[split]
     for name in ("path", "names"):
         content.pop(name, None)
-    return content, missing
+    return content, missing, wrong
 
 
 def _below(root: Path, listed: str) -> str | None:
     """A folder or list of pictures of a split relative to `root`. Roboflow writes "../" before it,
     though it is beside data.yaml."""
-    plain = listed
+    listed = plain = listed.replace("\\", "/")
     while plain.startswith("../"):
         plain = plain[3:]
     for name in dict.fromkeys((listed, plain)):
@@ -225,47 +239,80 @@ def _below(root: Path, listed: str) -> str | None:
 
 def _write_list(
     root: Path, name: str, folder: Path, new_names: Mapping[str, Sequence[str]]
-) -> None:
-    """The list of pictures of a split, with the new names."""
+) -> list[str]:
+    """Writes the list of pictures of a split, with the new names; says which lines name none."""
     lines: list[str] = []
-    for line in map(str.strip, read_text(root / name).splitlines()):
-        places = [root / name / ".." / line, root / line]
-        files = [os.path.relpath(place, root) for place in places]
-        lines += next((new_names[file] for file in files if file in new_names), ())
+    lost: list[str] = []
+    for line in read_list(root / name):
+        plain = line.replace("\\", "/")
+        files = [os.path.relpath(place / plain, root) for place in (root / name / "..", root)]
+        new = next((new_names[file] for file in files if file in new_names), None)
+        lines += new or ()
+        lost += [line] * (new is None)
     replace_file(folder / name, "".join(f"./{line}\n" for line in lines))
+    return [f"{root / name} lists pictures that are not in {root}, {some(lost)}"] if lost else []
 
 
-def _labels(text: str, size: Size, classes: int, per_keypoint: int) -> tuple[Labels, list[str]]:
+def _lines(text: Path) -> list[tuple[str, str, np.ndarray]]:
+    """The lines of a text, if it is there: their places in words, what they hold, and its numbers,
+    none if they are no numbers."""
+    lines = []
+    try:
+        content = read_text(text).splitlines() if text.is_file() else []
+    except ValueError as error:
+        return [(f"{error}:", "", np.zeros(0))]
+    for number, line in enumerate(map(str.strip, content), 1):
+        try:
+            row = np.array(line.split(), float)
+        except ValueError:
+            row = np.zeros(0)
+        lines += [(f"{text}, line {number}", line, row)] * bool(line)
+    return lines
+
+
+def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
+    """Texts with labels that are those of no picture, in words, where those of pictures are."""
+    used, folders = set(texts), {text.parent for text in texts}
+    roots = {place for folder in folders for place in (folder, *folder.parents)}
+    roots = {place for place in roots if place.name == "labels"}
+    alone = [text for text in map(Path, files_below(root)) if text not in used]
+    return [
+        f"{text} has {count} labels, but no picture has its name: did a tool change it?"
+        for text in alone
+        if text.suffix == ".txt" and (text.parent in folders or not roots.isdisjoint(text.parents))
+        if (count := sum(len(row) > 4 for *_, row in _lines(text)))
+    ]  # fmt: skip
+
+
+def _labels(
+    lines: Sequence[tuple[str, str, np.ndarray]], size: Size, classes: int, shape: Sequence[int]
+) -> tuple[Labels, list[str]]:
     instances, wrong = [], []
-    lines = read_text(text).splitlines() if Path(text).is_file() else []
-    for number, line in enumerate(lines, 1):
-        if line.strip():
-            try:
-                instances.append(_instance(line, np.array(size[::-1]), classes, per_keypoint))
-            except ValueError as error:
-                wrong.append(f"{text}, line {number}: {error}, got {line.strip()[:80]!r}")
+    for place, line, row in lines:
+        try:
+            instances.append(_instance(row, size, classes, *shape))
+        except ValueError as error:
+            wrong.append(f"{place} {error}, got {line[:80]!r}")
     return Labels(Instances.joined(instances), size), wrong
 
 
-def _instance(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> Instances:
-    try:
-        category, *rest = map(float, line.split())
-        numbers = np.array(rest)
-    except ValueError:
-        category, numbers = -1.0, np.zeros(0)
-    keypoints = None
-    if per_keypoint and len(numbers) > 4 and (len(numbers) - 4) % per_keypoint == 0:
+def _instance(
+    row: np.ndarray, size: Size, classes: int, count: int, per_keypoint: int
+) -> Instances:
+    category, numbers = row[0] if len(row) else -1.0, row[1:]
+    keypoints, more, sides = None, count * per_keypoint, np.array(size[::-1])
+    counts = (4, 4 + more) if more else (4, *range(6, len(row), 2))
+    if not (category in range(classes) and len(numbers) in counts and np.isfinite(row).all()):
+        others = f"{more} of keypoints, by kpt_shape" if more else "pairs of an outline"
+        raise ValueError(
+            f"must be a class below {classes} and 4 numbers of a box, or {others}, without a score "
+            "or a track"
+        )
+    if len(numbers) == 4 + more > 4:
         keypoints = numbers[4:].reshape(-1, per_keypoint)
         numbers = numbers[:4]
         visibility = keypoints[:, 2] if per_keypoint == 3 else 2.0 * keypoints.any(1)
         keypoints = np.column_stack((keypoints[:, :2] * sides, visibility))
-    is_form = len(numbers) == 4 or (len(numbers) >= 6 and len(numbers) % 2 == 0)
-    if not (category in range(classes) and is_form and np.isfinite(numbers).all()):
-        raise ValueError(
-            f"must be a class below {classes} and 4 numbers of a box, or pairs of an outline"
-        )
-    if np.abs(numbers).max() > _FAR:
-        raise ValueError(f"must be shares of the sides of the picture, none above {_FAR}")
     table = numbers.reshape(-1, 2) * sides
     if len(table) == 2:
         box = np.concatenate((table[0] - table[1] / 2, table[0] + table[1] / 2))
@@ -273,6 +320,6 @@ def _instance(line: str, sides: np.ndarray, classes: int, per_keypoint: int) -> 
         box = box_of([table])
     if not (box[:2] < box[2:]).all():
         raise ValueError("must have an area")
-    has_outline = len(table) > 2 and area_of(table) > NO_AREA
-    outline = [table] if has_outline else ()
-    return labelled(int(category), box, outline=outline, keypoints=keypoints)
+    outline = [table] if len(table) > 2 and area_of(table) > NO_AREA else ()
+    unit = "shares of the sides of the picture"
+    return labelled(int(category), box, size, unit, outline=outline, keypoints=keypoints)
