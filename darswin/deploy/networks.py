@@ -10,7 +10,7 @@ from torch.utils import _pytree as pytree
 import darswin.deploy.lowering  # noqa: F401  (it registers the rules)
 from darswin.deploy.packed import refuse_gradients
 from darswin.deploy.program import Checked, NoProgramError, Weights
-from darswin.deploy.record import Trace, inverse, traced
+from darswin.deploy.record import Trace, identity, inverse, traced
 from darswin.lens import Equidistant
 from darswin.models.adapter import adapted
 from darswin.models.base import Model
@@ -107,11 +107,11 @@ class Programs:
     def _written(self, prepared: Prepared, shapes: Any) -> _Known:
         trace = self._trace(prepared, shapes)
         places = {
-            (one.data_ptr(), one.shape): k
+            identity(one): k
             for k, one in enumerate(pytree.tree_leaves(prepared))
             if isinstance(one, Tensor)
         }
-        fields = [places.get((one.data_ptr(), one.shape)) for one in trace.given]
+        fields = [places.get(identity(one)) for one in trace.given]
         found = [k for k in fields if k is not None]
         return _Known(trace.program.checked(), trace, found if len(found) == len(fields) else None)
 

@@ -41,7 +41,7 @@ POINTS = torch.rand(1, 3, 4, 2) * 6 - 1
 
 def split(x, linear=lambda x: x):
     """Tokens (1, 4, 6, 12) each as two below each other, as in a decoder."""
-    x = x.reshape(1, 4, 6, 2, 6).permute(0, 1, 3, 2, 4).reshape(1, 8, 6, 6)
+    x = x.unflatten(3, (2, 6)).permute(0, 1, 3, 2, 4).flatten(1, 2)
     return linear(x)
 
 
@@ -178,7 +178,7 @@ class Refused(nn.Module):
         (lambda x: x * 2, "mul is no instruction"),
         (lambda x: F.conv2d(x, torch.ones(1, 3, 1, 1)), "convolution of 1 × 1"),
         (lambda x: F.interpolate(x, (2, 2), mode="nearest"), "this interpolation, nearest"),
-        (lambda x: x + torch.ones(3, 1, 1), "a sum of values of other shapes"),
+        (lambda x: x + torch.ones(3, 1, 1), r"a tensor \(3, 1, 1\) beside pictures"),
         (lambda x: F.relu(x, inplace=True), "a ReLU in place"),
         (lambda x: F.max_pool2d(x, 2), "this pooling"),
         (lambda x: x.mean(3), r"a mean over the axes"),
