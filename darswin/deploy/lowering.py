@@ -43,26 +43,6 @@ def _(x: Recorded, dim: int | None = None) -> Any:
     return sizes if dim is None else sizes[dim]
 
 
-@lowers(Tensor.dim, Tensor.ndim.__get__)
-def _(x: Recorded) -> int:
-    return x.whole.dim()
-
-
-@lowers(Tensor.dtype.__get__)
-def _(x: Recorded) -> torch.dtype:
-    return torch.float32
-
-
-@lowers(Tensor.is_floating_point, torch.is_floating_point)
-def _(x: Recorded) -> bool:
-    return True
-
-
-@lowers(Tensor.requires_grad.__get__)
-def _(x: Recorded) -> bool:
-    return False
-
-
 @lowers(Tensor.device.__get__)
 def _(x: Recorded) -> torch.device:
     return torch.device("cpu")  # where tensors of the lens are

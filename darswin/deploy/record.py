@@ -25,6 +25,10 @@ from darswin.deploy.program import NoProgramError, Program, Slot, Weights
 from darswin.models.prepared import Prepared
 
 RULES: dict[Any, tuple[Callable[..., Any], inspect.Signature]] = {}  # lowering.py has them
+_FORM = {  # what a program knows of a value
+    Tensor.dim, Tensor.ndim.__get__, Tensor.dtype.__get__, Tensor.requires_grad.__get__,
+    Tensor.is_floating_point, torch.is_floating_point,
+}  # fmt: skip
 _RESHAPES = (Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten)
 _COUNT = 10_007  # of pictures while a program is written; no axis is as long
 
@@ -170,6 +174,8 @@ def _viewed(function: Any, arguments: Sequence[Any], named: dict[str, Any]) -> A
     if len(values) != 1 or sum(isinstance(leaf, Tensor) for leaf in leaves) > 1:
         _refuse(function)
     (value,) = values
+    if function in _FORM:
+        return function(value.whole)
     arguments, named = pytree.tree_map_only(Recorded, lambda v: v.whole, (arguments, named))
     try:
         with torch._C.DisableTorchFunctionSubclass(), _Unchanged(function):
