@@ -40,11 +40,11 @@ _ALONE = (
 # The kinds of layers that are known, and those of their parts.
 _PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {
     **{kind: {} for kind in _ALONE},
-    **dict.fromkeys((PatchProjection, PatchEmbed), dict(proj=_CONV, norm=_NORM)),
+    **{kind: dict(proj=_CONV, norm=_NORM) for kind in (PatchProjection, PatchEmbed)},
     PolarPatchEmbed: dict(proj=_LINEAR, norm=_NORM),
     PatchMerging: dict(norm=_NORM, reduction=_LINEAR),
     ConvBlock: {str(k): (kind,) for k, kind in enumerate((nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2)},
-    **dict.fromkeys((WindowAttention, PolarWindowAttention), _OF_ATTENTION),
+    **{kind: _OF_ATTENTION for kind in (WindowAttention, PolarWindowAttention)},
     Mlp: dict(fc1=_LINEAR, fc2=_LINEAR),
     Block: dict(
         norm1=_NORM, attn=(WindowAttention, PolarWindowAttention), norm2=_NORM, mlp=(Mlp,),
@@ -75,27 +75,15 @@ def is_plain(layer: nn.Module) -> bool:
         return len(layer.normalized_shape) == 1 and layer.bias is not None
     if isinstance(layer, nn.BatchNorm2d):
         return layer.running_mean is not None
-    if isinstance(layer, PatchProjection):
-        conv = layer.proj
-        usual = conv.kernel_size, (0, 0), (1, 1), 1
-        side, _ = conv.kernel_size
-        return (
-            conv.stride,
-            conv.padding,
-            conv.dilation,
-            conv.groups,
-        ) == usual and conv.kernel_size == (side, side)
+    if isinstance(layer, PatchProjection) and isinstance(conv := layer.proj, nn.Conv2d):
+        sides = {*conv.kernel_size, *conv.stride}
+        return len(sides) == 1 and (conv.padding, conv.dilation, conv.groups) == ((0, 0), (1, 1), 1)
     return True
 
 
 def fast(layer: nn.Module, weights: Weights) -> nn.Module:
-    """The layer that takes the place of another one, which may be the same with fast layers in it."""
-    if (
-        isinstance(layer, Stage)
-        and type(layer) is Stage
-        and is_plain(layer)
-        and _is_one_operator(layer)
-    ):
+    """The layer that takes the place of another one: it may be this one, with fast layers in it."""
+    if type(layer) is Stage and is_plain(layer) and _is_one_operator(layer):
         return FastStage(layer, weights)
     if type(layer) in FORMS and other_part(layer) is None:
         return FORMS[type(layer)](layer, weights)
@@ -208,16 +196,19 @@ def _is_one_operator(stage: Stage) -> bool:
 
 
 class OneBlock(InFloat32):
-    """A block of another stage, or another block, which torch runs."""
+    """A block of another kind of stage, or another kind of block, which torch runs."""
 
     def __init__(self, block: Block, weights: Weights):
         super().__init__(block)
-        self.other = type(other_part(block) or block).__name__
+        self.other = other_part(block)
+        self.own = OwnBlocks([block], weights) if self.other is None else None
 
-    def forward(self, x: Tensor, *others: Tensor) -> Tensor:
+    def forward(self, x: Tensor, *tables: Tensor) -> Tensor:
+        if self.own is not None:
+            return self.own(x, tables)
         if isinstance(x, Recorded):
-            raise NoProgramError(f"{self.other} is no instruction")
-        return super().forward(x, *others)
+            raise NoProgramError(f"{type(self.other).__name__} is no instruction")
+        return super().forward(x, *tables)
 
 
 FORMS: dict[type[nn.Module], Callable[[Any, Weights], nn.Module]] = {

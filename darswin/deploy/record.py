@@ -76,13 +76,13 @@ class _Unchanged(TorchDispatchMode):
         return operator(*arguments, **(named or {}))
 
 
-def _named(function: Any) -> str:
+def name_of(function: Any) -> str:
     return resolve_name(function) or getattr(function, "__name__", str(function))
 
 
 def _refuse(function: Any, reason: object = None) -> NoReturn:
     raise NoProgramError(
-        f"{_named(function)} is no instruction" + (f": {reason}" if reason else "")
+        f"{name_of(function)} is no instruction" + (f": {reason}" if reason else "")
     )
 
 
@@ -226,6 +226,10 @@ class Output(NamedTuple):
     slot: Slot
     order: Sequence[int]
 
+    def ordered(self, numbers: Tensor) -> Tensor:
+        """The output with its axes in the order of the result."""
+        return numbers.permute(inverse(self.order))
+
 
 class Trace:
     """The program of a network for what it sees of one image, in the course of its writing.
@@ -346,16 +350,22 @@ class Trace:
         return self.value(out, torch.empty_strided(sizes, (*strides, 1), device="meta"))
 
     def finish(self, results: Any) -> None:
-        """Makes recorded results the outputs. In a file, their axes are in order in memory."""
+        """Makes recorded results the outputs."""
         self.is_list = isinstance(results, list)
-        if not all(isinstance(each, Tensor) for each in (results if self.is_list else [results])):
-            raise NoProgramError(f"its result, {type(results).__name__}, is no list of tensors")
         for result in results if self.is_list else [results]:
-            value = self.of(result)
-            order = list(range(value.dim())) if self.for_file else value.made().order()
-            slot = self.dense(value, order)
-            self.program.output(slot)
-            self.results.append(Output(slot, order))
+            self.output(self.of(result))
+
+    def output(self, value: Recorded) -> None:
+        """Makes a value the next output. In a file, its axes are in order in memory."""
+        order = list(range(value.dim())) if self.for_file else value.made().order()
+        slot = self.dense(value, order)
+        self.program.output(slot)
+        self.results.append(Output(slot, order))
+
+    def returned(self, outputs: Sequence[Tensor]) -> Any:
+        """What the network returns for these outputs of the program."""
+        results = [of.ordered(each) for of, each in zip(self.results, outputs, strict=True)]
+        return results if self.is_list else results[0]
 
 
 def identity(value: Tensor) -> tuple:

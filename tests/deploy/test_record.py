@@ -11,7 +11,7 @@ from torch import nn
 from darswin import optimize
 from darswin.deploy.own import OwnLinear, OwnNorm, packed_weights
 from darswin.deploy.program import NoProgramError, Weights
-from darswin.deploy.record import inverse, traced
+from darswin.deploy.record import traced
 from darswin.lens import Spherical
 from darswin.lens.pixels import sample_at
 from darswin.models.pixel import distances
@@ -25,10 +25,7 @@ def run(forward, *images, for_file=False):
     inputs = [x, *more]
     if more and for_file:
         inputs[1] = more[0].permute(0, 2, 3, 1).contiguous()
-    found = trace.program.checked()([*inputs, *trace.given])
-    pairs = zip(found, trace.results, strict=True)
-    found = [one.permute(inverse(of.order)) for one, of in pairs]
-    return found if trace.is_list else found[0]
+    return trace.returned(trace.program.checked()([*inputs, *trace.given]))
 
 
 CONV, CONV2 = nn.Conv2d(3, 5, 3, padding=1), nn.Conv2d(5, 5, 3, padding=1)
