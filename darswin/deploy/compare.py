@@ -20,6 +20,7 @@ def tolerance_of(model: nn.Module) -> float:
     return IN_8_BITS if quantized_layers(model) else IN_FLOAT32
 
 
+@torch.no_grad()
 def compare(
     trace: Trace, inputs: Sequence[Tensor], pictures: Sequence[Tensor],
     model: Callable[..., Any], layers: Callable[..., Any], tolerance: float,

@@ -44,7 +44,7 @@ _PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {
     PolarPatchEmbed: dict(proj=_LINEAR, norm=_NORM),
     PatchMerging: dict(norm=_NORM, reduction=_LINEAR),
     ConvBlock: {str(k): (kind,) for k, kind in enumerate((nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2)},
-    **{kind: _OF_ATTENTION for kind in (WindowAttention, PolarWindowAttention)},
+    **dict.fromkeys((WindowAttention, PolarWindowAttention), _OF_ATTENTION),
     Mlp: dict(fc1=_LINEAR, fc2=_LINEAR),
     Block: dict(
         norm1=_NORM, attn=(WindowAttention, PolarWindowAttention), norm2=_NORM, mlp=(Mlp,),

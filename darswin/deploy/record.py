@@ -12,6 +12,7 @@ number of pictures and the numbers of a lens are not shown to the network, which
 import inspect
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
@@ -19,7 +20,6 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import resolve_name
 from torch.utils import _pytree as pytree
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin.deploy.program import NoProgramError, Program, Slot, Weights
 from darswin.models.prepared import Prepared
@@ -63,19 +63,6 @@ for _name in (
 PICTURES = Pictures(_COUNT)
 
 
-class _Unchanged(TorchDispatchMode):
-    """A context in which a function changes no numbers in place."""
-
-    def __init__(self, function: Any):
-        super().__init__()
-        self.function = function
-
-    def __torch_dispatch__(self, operator, types, arguments=(), named=None):
-        if operator._schema.is_mutable:
-            _refuse(self.function, "it writes in place")
-        return operator(*arguments, **(named or {}))
-
-
 def name_of(function: Any) -> str:
     return resolve_name(function) or getattr(function, "__name__", str(function))
 
@@ -84,6 +71,23 @@ def _refuse(function: Any, reason: object = None) -> NoReturn:
     raise NoProgramError(
         f"{name_of(function)} is no instruction" + (f": {reason}" if reason else "")
     )
+
+
+def _unchanged(function: Any, run: Callable, arguments: Any, named: dict[str, Any]) -> Any:
+    """What a function returns, which must not write in the tensors that it takes."""
+    tensors = [leaf for leaf in pytree.tree_leaves((arguments, named)) if isinstance(leaf, Tensor)]
+    with torch._C.DisableTorchFunctionSubclass():
+        before = [*map(_state, tensors)]
+        result = run(arguments, named)
+        if before != [*map(_state, tensors)]:
+            _refuse(function, "it writes in place")
+    return result
+
+
+def _state(tensor: Tensor) -> tuple:
+    """What changes when a function writes in a tensor. Torch itself keeps inference tensors."""
+    version = 0 if tensor.is_inference() else tensor._version
+    return version, tensor.shape, tensor.stride(), tensor.untyped_storage()._cdata
 
 
 class OfLens(Tensor):
@@ -95,8 +99,8 @@ class OfLens(Tensor):
             return NotImplemented
         if getattr(function, "__name__", "") in _NUMBERS:
             _refuse(function, "it reads numbers that depend on the lens")
-        with _Unchanged(function):
-            return super().__torch_function__(function, types, arguments, named or {})
+        run = super().__torch_function__
+        return _unchanged(function, partial(run, function, types), arguments, named or {})
 
 
 # What torch makes of a tensor for Python: numbers, which may decide what comes next.
@@ -178,8 +182,7 @@ def _viewed(function: Any, arguments: Sequence[Any], named: dict[str, Any]) -> A
         return function(value.whole)
     arguments, named = pytree.tree_map_only(Recorded, lambda v: v.whole, (arguments, named))
     try:
-        with torch._C.DisableTorchFunctionSubclass(), _Unchanged(function):
-            result = function(*arguments, **named)
+        result = _unchanged(function, lambda a, n: function(*a, **n), arguments, named)
     except NoProgramError:
         raise
     except Exception as error:
@@ -415,7 +418,7 @@ def traced(
     if not for_file:
         prepared = pytree.tree_map_only(Tensor, lambda t: t.as_subclass(OfLens), prepared)
     try:
-        with torch.no_grad():
+        with torch.no_grad(), torch.inference_mode(False):
             trace.finish(forward(x, prepared, pixels))
     except Exception as error:  # also of the network, of values that it cannot take
         text = error if isinstance(error, NoProgramError) else f"{type(error).__name__}: {error}"
