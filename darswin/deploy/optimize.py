@@ -9,7 +9,7 @@ from typing import Any, NoReturn, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.parametrize import remove_parametrizations
+from torch.nn.utils.parametrize import is_parametrized
 
 from darswin.deploy.fast import fast
 from darswin.deploy.networks import Programs
@@ -100,9 +100,12 @@ def references(model: Net) -> list[Net]:
 def fast_copy(model: Any) -> Any:
     """A copy of a model with fast layers, still without programs."""
     made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
-    for part in [*made.modules()]:
-        for name in [*getattr(part, "parametrizations", ())]:
-            remove_parametrizations(part, name)  # what they compute stays
+    for part in filter(is_parametrized, [*made.modules()]):
+        values = {name: getattr(part, name).detach().clone() for name in part.parametrizations}
+        part.__class__ = type(part).__bases__[0]  # torch's own removal would change all copies
+        del part.parametrizations
+        for name, value in values.items():
+            part.register_parameter(name, nn.Parameter(value, False))
     weights = Weights()
     fast(made, weights)
     for part in made.modules():

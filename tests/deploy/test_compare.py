@@ -1,0 +1,299 @@
+"""Networks of one's own: a program computes what the model computes, or is refused by name."""
+
+import inspect
+import random
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from frame_samples import network_of
+from helpers import products, refused, slow
+from torch import nn
+from torch.nn.utils import parametrizations
+
+from darswin import optimize
+from darswin.deploy import record
+from darswin.deploy.lowering import RELU, _applied
+from darswin.lens import Equidistant
+from darswin.models.conv_unet import ConvBlock, ConvUnet
+
+SIDE = 8
+
+
+class Step(nn.Module):
+    """A function of a map (B, 4, 8, 8), of its layers and of the rays of the lens."""
+
+    def __init__(self, function, *layers):
+        super().__init__()
+        self.function, self.layers = function, nn.ModuleList(layers)
+
+    def forward(self, x, rays):
+        return self.function(x, *self.layers, *([rays] if not self.layers else []))
+
+
+def of_layer(make):
+    return lambda: Step(lambda x, layer: layer(x), make())
+
+
+def of_map(function):
+    return lambda: Step(lambda x, _: function(x))
+
+
+def of_rays(function):
+    return lambda: Step(function)
+
+
+class Network(ConvUnet):
+    """A convolution of colours and rays, and steps."""
+
+    def __init__(self, steps):
+        super().__init__(4, 3, widths=(4,))
+        self.image_size, self.steps = (SIDE, SIDE), nn.ModuleList(steps)
+
+    def forward_network(self, x, prepared, images):
+        rays = prepared.rays
+        x = self.down[0](torch.cat((x, rays.to(x).expand(x.shape[0], -1, -1, -1)), 1))
+        for step in self.steps:
+            x = step(x, rays)
+        return x
+
+
+def hooked(layer, *, before=False):
+    if before:
+        layer.register_forward_pre_hook(lambda _, given: (2 * given[0],))
+    else:
+        layer.register_forward_hook(lambda _, given, out: out + out)
+    return layer
+
+
+def with_forward(layer):
+    layer.forward = lambda x: F.linear(x, 2 * layer.weight, layer.bias)
+    return layer
+
+
+def changed(layer, **attributes):
+    for name, value in attributes.items():
+        setattr(layer, name, value)
+    return layer
+
+
+def with_activation(kind):
+    block = ConvBlock(4, 4)
+    block[2] = kind()
+    return block
+
+
+class Scaled(nn.Linear):
+    def forward(self, x):
+        return F.linear(x, 2 * self.weight, self.bias)
+
+
+class Residual(ConvBlock):
+    def forward(self, x):
+        return super().forward(x) + x
+
+
+class LayerNorm2d(nn.LayerNorm):
+    def forward(self, x):
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class Encoder(nn.TransformerEncoderLayer):
+    def forward(self, x):
+        return super().forward(x[:, 0])[:, None].expand(-1, 4, -1, -1)
+
+
+class Around(nn.Linear):
+    """A layer that reads the weights of another one."""
+
+    def __init__(self, inner):
+        super().__init__(SIDE, SIDE)
+        self.inner = inner
+
+    def forward(self, x):
+        return F.linear(self.inner(x), self.inner.weight)
+
+
+def conv(**options):
+    return nn.Conv2d(4, 4, 3, padding=1, **options)
+
+
+def shared():
+    """Two convolutions with one weight and two biases."""
+    one, two = conv(), conv()
+    two.weight = one.weight
+    return Step(lambda x, *convs: convs[1](convs[0](x)), one, two)
+
+
+def written(function):
+    """A step that changes a copy of its map in place."""
+
+    def changes(x):
+        x = x + x
+        function(x)
+        return x
+
+    return of_map(changes)
+
+
+def four(rays):
+    return torch.cat((rays, rays[:, :1]), 1)
+
+
+def resampled(x):
+    pooled = F.max_pool2d(x, 2, ceil_mode=True)
+    return F.interpolate(pooled, (SIDE, SIDE), mode="bilinear")
+
+
+CHANNELS = torch.arange(4).view(1, 4, 1, 1).expand(1, 4, SIDE, SIDE)
+LEFT = (torch.arange(SIDE) < 3).expand(1, 1, SIDE, SIDE)
+INSTRUCTIONS = [
+    of_layer(conv), of_layer(lambda: conv(bias=False)), of_layer(nn.ReLU), of_layer(nn.GELU),
+    of_layer(lambda: nn.Linear(SIDE, SIDE)), of_layer(lambda: nn.LayerNorm(SIDE)),
+    of_layer(lambda: ConvBlock(4, 4)), of_layer(lambda: nn.Dropout(0.5)), shared,
+    of_layer(lambda: parametrizations.weight_norm(conv())),
+    of_map(lambda x: x + x), of_map(lambda x: torch.cat((x[:, 2:], x[:, :2]), 1)),
+    of_map(lambda x: x.transpose(2, 3)), of_map(lambda x: x.transpose(1, 3).transpose(3, 1)),
+    of_map(lambda x: x.flatten(2).unflatten(2, (SIDE, SIDE)).contiguous()),
+    of_map(lambda x: x.reshape(x.shape[0], -1).reshape(x.shape)),
+    of_map(lambda x: x[:, :1].expand(-1, 4, -1, -1) + x),
+    of_map(lambda x: torch.cat(x.chunk(2, 3), 3)), of_map(resampled),
+    of_map(lambda x: torch.where(LEFT, x, 0.0)), of_map(lambda x: x.to(torch.float32).float()),
+    of_rays(lambda x, rays: x + four(rays)),
+    of_rays(lambda x, rays: four(rays).transpose(2, 3) + x),
+    of_rays(lambda x, rays: x + rays[:, :1].expand(-1, 4, -1, -1)),
+    of_rays(lambda x, rays: torch.cat((rays.flip(3).expand(x.shape[0], -1, -1, -1), x[:, :1]), 1)),
+]  # fmt: skip
+OTHERS = [
+    # in place
+    of_layer(lambda: nn.SiLU(inplace=True)), of_layer(lambda: nn.ReLU(inplace=True)),
+    of_layer(lambda: nn.Hardswish(inplace=True)),
+    *map(written, (
+        lambda x: x.add_(1.0), lambda x: x.__iadd__(x), lambda x: x.clamp_(0, 1),
+        lambda x: x.zero_(), lambda x: x.exp_().clamp_(max=9.0), lambda x: torch.relu_(x),
+        lambda x: x.data.mul_(0.5), lambda x: torch.neg(x, out=x), lambda x: x[:, 1].fill_(2.0),
+        lambda x: x.__setitem__((slice(None), slice(2)), 0.0), lambda x: x.transpose_(2, 3),
+        lambda x: x.__setitem__((slice(None), slice(2)), x[:, 2:4]), lambda x: x.copy_(x + x),
+        lambda x: x.permute(0, 2, 3, 1).sub_(1.0), lambda x: torch.add(x, x, out=x),
+    )),
+    of_rays(lambda x, rays: x + four(rays.clone().mul_(2.0))),
+    # casts
+    *(of_map(lambda x, dtype=dtype: x.to(dtype).float())
+      for dtype in (torch.int32, torch.uint8, torch.bool, torch.float16, torch.bfloat16)),
+    of_map(lambda x: x.double().float()), of_map(lambda x: x.half().float()),
+    of_map(lambda x: x.type(torch.int16).type_as(x)), of_map(lambda x: x.bool() + x),
+    of_map(lambda x: x.contiguous().view(torch.int32).float() * 1e-9),
+    # branches
+    of_map(lambda x: x + x if x.shape[0] > 3 else x), of_map(lambda x: x if len(x) < 4 else x + x),
+    of_map(lambda x: x + x if x.size(0) % 2 else x), of_map(lambda x: x + x if x.sum() > 0 else x),
+    of_map(lambda x: x + x if x.numel() > 999 else x),
+    of_map(lambda x: F.gelu(x.split(4)[0] + x[:4])),
+    of_map(lambda x: sum(each[None] for each in x).expand_as(x)),
+    of_map(lambda x: x * x.shape[0]), of_map(lambda x: x + x if x.max().item() > 2 else x),
+    of_map(lambda x: x.flip(0)), of_map(lambda x: torch.cat((x[1:], x[:1]))),
+    of_rays(lambda x, rays: x + x if rays[0, 0, 0, 0] > -0.5 else x),
+    of_rays(lambda x, rays: x + x if rays.mean().item() > 0.7 else x),
+    # layers that are others than they look
+    of_layer(lambda: Scaled(SIDE, SIDE)), of_layer(lambda: Residual(4, 4)),
+    of_layer(lambda: LayerNorm2d(4)), of_layer(lambda: nn.LayerNorm((4, SIDE, SIDE))),
+    of_layer(lambda: hooked(nn.Linear(SIDE, SIDE))), of_layer(lambda: hooked(conv(), before=True)),
+    of_layer(lambda: hooked(ConvBlock(4, 4))), of_layer(lambda: hooked(nn.Identity(), before=True)),
+    of_layer(lambda: with_forward(nn.Linear(SIDE, SIDE))),
+    of_layer(lambda: changed(ConvBlock(4, 4), forward=nn.Hardtanh())),
+    of_layer(lambda: Around(nn.Linear(SIDE, SIDE))),
+    of_layer(lambda: nn.LayerNorm(SIDE, bias=False)), of_layer(lambda: nn.GroupNorm(2, 4)),
+    of_layer(lambda: nn.LayerNorm(SIDE, elementwise_affine=False)),
+    *(of_layer(lambda kind=kind: with_activation(kind)) for kind in (nn.GELU, nn.SiLU)),
+    of_layer(lambda: conv(padding_mode="circular")), of_layer(lambda: conv(groups=2)),
+    of_layer(lambda: ConvBlock(4, 4).append(nn.Dropout(0.1))),
+    of_layer(lambda: nn.Softmax(3)), of_layer(lambda: Encoder(SIDE, 2, 8, batch_first=True)),
+    # arguments that a rule does not take
+    of_layer(lambda: nn.GELU("tanh")), of_map(lambda x: torch.add(x, F.gelu(x), alpha=0.5)),
+    of_map(lambda x: x + x.mean((2, 3), keepdim=True).expand_as(x)), of_map(lambda x: 1.0 + x),
+    of_map(lambda x: torch.where(CHANNELS > 1, x, 0.0)),
+    of_map(lambda x: torch.where(x > 0, x, 0.0)), of_map(lambda x: torch.where(LEFT, x, 1.0)), of_map(lambda x: F.max_pool2d(x, 3, 1, 1)),
+    of_map(lambda x: F.interpolate(x, scale_factor=2)[:, :, ::2, ::2]),
+    of_map(lambda x: x.as_strided(x.shape, x.contiguous().transpose(2, 3).stride())),
+    of_map(lambda x: x[:, :1].squeeze().reshape(x[:, :1].shape).expand(-1, 4, -1, -1)),
+    of_map(lambda x: F.conv2d(x, x[:1, :, :3, :3].expand(4, -1, -1, -1), padding=1)),
+    of_rays(lambda x, rays: F.conv2d(x, four(rays[:1])[..., :3, :3].expand(4, 4, 3, 3), padding=1)),
+]  # fmt: skip
+
+
+def near(found, expected):
+    largest = expected[expected.isfinite()].abs().max().item() if expected.numel() else 0.0
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * largest, equal_nan=True)
+
+
+def check(steps, folder, refuses=None):
+    """A network of steps, optimized and in a file; `refuses`: whether it must be no program."""
+    model = Network(steps)
+    for parameter in model.parameters():
+        nn.init.normal_(parameter, std=0.4)
+    model.eval()
+    lenses = Equidistant.from_fov(torch.linspace(1.0, 4.0, 5), SIDE / 2)
+    with torch.no_grad():
+        fast = optimize(model)
+        assert not fast.lack or fast.lack.startswith("layer by layer, because of ")
+        assert refuses is None or bool(fast.lack) == refuses
+        for count in (1, 3, 5):
+            images = torch.randn(count, 3, SIDE, SIDE)
+            for lens in (lenses[:1], lenses[:count]):
+                near(fast(images, lens), model(images, lens))
+        try:
+            network = network_of(model, folder, lenses[4], mean=0.5, std=0.2)
+        except TypeError as error:
+            assert "one that a file can contain, got Network: " in str(error)
+            return
+        frame = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
+        image = (torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255 - 0.5) / 0.2
+        near(torch.from_numpy(network(frame))[None], model(image, lenses[4]))
+
+
+def drawn(seed):
+    """The steps of a random network, and whether all are instructions."""
+    chance = random.Random(seed)
+    torch.manual_seed(seed)
+    tables = chance.choices([INSTRUCTIONS, OTHERS], [3, 1], k=chance.randint(1, 5))
+    return [chance.choice(table)() for table in tables], OTHERS not in tables
+
+
+@pytest.mark.parametrize("k", range(len(OTHERS)))
+def test_what_is_no_instruction_is_refused(k, tmp_path):
+    torch.manual_seed(k)
+    check([OTHERS[k]()], tmp_path)
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(40), pytest.param(range(40, 2000), marks=[slow, products])], ids=len
+)
+def test_random_networks_are_equal_or_refused(seeds, tmp_path):
+    for seed in seeds:
+        steps, known = drawn(seed)
+        check(steps, tmp_path, refuses=False if known else None)
+
+
+def test_what_differs_is_not_used_and_named(monkeypatch):
+    def wrong(x: record.Recorded, approximate="none"):
+        return _applied(RELU, x)
+
+    monkeypatch.setitem(record.RULES, F.gelu, (wrong, inspect.signature(wrong)))
+    model = Network([INSTRUCTIONS[0](), of_layer(nn.GELU)(), INSTRUCTIONS[0]()]).eval()
+    said = r"steps\.1\.layers\.0 \(GELU\): torch\.nn\.functional\.gelu computes something else"
+    refused(said, optimize, model, strict=True, error=TypeError)
+    images, lens = torch.randn(2, 3, SIDE, SIDE), Equidistant.from_fov(3.0, SIDE / 2)
+    with torch.no_grad():
+        near(optimize(model)(images, lens), model(images, lens))
+
+
+def test_the_comparison_leaves_the_model_and_random_numbers_as_they_were():
+    model = Network([of_map(lambda x: x + torch.rand(1, 4, SIDE, SIDE))()]).train()
+    model.register_buffer("calls", torch.zeros(()))
+    model.register_forward_hook(lambda module, *_: module.calls.add_(1))
+    state, before = torch.get_rng_state(), {k: v.clone() for k, v in model.state_dict().items()}
+    fast = optimize(model)
+    assert "torch.Tensor.add computes something else" in fast.lack
+    assert torch.equal(torch.get_rng_state(), state) and model.training and model.steps.training
+    assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
+    assert all(p.requires_grad for p in model.parameters()) and model._forward_hooks
