@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from darswin.compat.official import OfficialAttention
 from darswin.deploy.own import OwnLinear, OwnNorm, own_linear, pack
 from darswin.deploy.packed import InFloat32, InPlaceOf, OwnBlocks, refuse_gradients
 from darswin.deploy.program import NoProgramError, Weights
@@ -17,7 +18,6 @@ from darswin.deploy.record import Recorded
 from darswin.layers.attention import PolarWindowAttention, WindowAttention
 from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
 from darswin.layers.linear import Linear
-from darswin.layers.position_bias import AngularRelativeBias, FourierBias, RelativeTable
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
 from darswin.layers.transformer import Block, DropPath, Mlp, PatchMerging, Stage
 from darswin.models.conv_unet import ConvBlock
@@ -25,32 +25,20 @@ from darswin.models.unet import Unet
 from darswin.views import PolarGrid
 
 _LINEAR, _NORM, _CONV = (nn.Linear, Linear, QuantizedLinear), (nn.LayerNorm,), (nn.Conv2d,)
-_OF_ATTENTION = dict(
-    qkv=_LINEAR, proj=_LINEAR, position_bias=(RelativeTable, AngularRelativeBias, FourierBias)
-)
-_ALONE = (
-    *_LINEAR,
-    *_NORM,
-    *_CONV,
-    nn.BatchNorm2d,
-    nn.ReLU,
-    DropPath,
-    *_OF_ATTENTION["position_bias"],
-)
-# The kinds of layers that are known, and those of their parts.
+_ATTENTION = (WindowAttention, PolarWindowAttention, OfficialAttention)
+_BLOCK = dict(norm1=_NORM, attn=_ATTENTION, norm2=_NORM, mlp=(Mlp,), drop_path=(DropPath,))
+_CONVS = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2
+# The kinds of layers that are known, and those of their parts. A position bias may be any.
 _PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {
-    **{kind: {} for kind in _ALONE},
+    **{kind: {} for kind in (*_LINEAR, *_NORM, *_CONVS, DropPath)},
     **{kind: dict(proj=_CONV, norm=_NORM) for kind in (PatchProjection, PatchEmbed)},
+    **{kind: dict(qkv=_LINEAR, proj=_LINEAR, position_bias=()) for kind in _ATTENTION},
     PolarPatchEmbed: dict(proj=_LINEAR, norm=_NORM),
     PatchMerging: dict(norm=_NORM, reduction=_LINEAR),
-    ConvBlock: {str(k): (kind,) for k, kind in enumerate((nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2)},
-    **dict.fromkeys((WindowAttention, PolarWindowAttention), _OF_ATTENTION),
+    ConvBlock: {str(k): (kind,) for k, kind in enumerate(_CONVS)},
     Mlp: dict(fc1=_LINEAR, fc2=_LINEAR),
-    Block: dict(
-        norm1=_NORM, attn=(WindowAttention, PolarWindowAttention), norm2=_NORM, mlp=(Mlp,),
-        drop_path=(DropPath,),
-    ),
-}  # fmt: skip
+    Block: _BLOCK,
+}
 
 
 def other_part(layer: nn.Module) -> nn.Module | None:
@@ -60,8 +48,7 @@ def other_part(layer: nn.Module) -> nn.Module | None:
         return layer
     for name, kinds in parts.items():
         part = layer.get_submodule(name)
-        other = other_part(part) if type(part) in kinds else part
-        if other is not None:
+        if kinds and (other := other_part(part) if type(part) in kinds else part) is not None:
             return other
     return None
 
