@@ -6,13 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from darswin.deploy.hidden import name_of
 from darswin.deploy.program import NoProgramError
-from darswin.deploy.record import RULES, Trace, name_of
+from darswin.deploy.record import RULES, Trace
 from darswin.layers.quantized import quantized_layers
 
 # Differences of results, as parts of their largest number. In float32, rounding ends at about 1e-6.
 # It may move a number of 8 bits by one step, and then grows up to the error of 8 bits itself.
-IN_FLOAT32, IN_8_BITS = 1e-4, 0.5
+IN_FLOAT32, IN_8_BITS = 1e-4, 0.25
 
 
 def tolerance_of(model: nn.Module) -> float:

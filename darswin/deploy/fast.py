@@ -26,7 +26,9 @@ from darswin.views import PolarGrid
 
 _LINEAR, _NORM, _CONV = (nn.Linear, Linear, QuantizedLinear), (nn.LayerNorm,), (nn.Conv2d,)
 _ATTENTION = (WindowAttention, PolarWindowAttention, OfficialAttention)
-_BLOCK = dict(norm1=_NORM, attn=_ATTENTION, norm2=_NORM, mlp=(Mlp,), drop_path=(DropPath,))
+_BLOCK: dict[str, Sequence[type[nn.Module]]] = dict(
+    norm1=_NORM, attn=_ATTENTION, norm2=_NORM, mlp=(Mlp,), drop_path=(DropPath,)
+)
 _CONVS = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2
 # The kinds of layers that are known, and those of their parts. A position bias may be any.
 _PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {

@@ -7,10 +7,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from darswin.deploy.hidden import PICTURES
 from darswin.deploy.own import OwnLinear, OwnNorm
 from darswin.deploy.packed import OwnBlocks
 from darswin.deploy.program import GELU, RELU, NoProgramError
-from darswin.deploy.record import PICTURES, Recorded, inverse, lowers
+from darswin.deploy.record import Recorded, inverse, lowers
 from darswin.lens.pixels import OUTSIDE, sample_at
 from darswin.models.pixel import distances
 from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
@@ -37,7 +38,7 @@ def _(blocks: OwnBlocks, x: Recorded, tables: Sequence[Tensor]) -> Recorded:
 # -- functions between them ----------------------------------------------------------------------
 
 
-@lowers(Tensor.shape.__get__, Tensor.size)
+@lowers(Tensor.shape.__get__, Tensor.size)  # type: ignore[attr-defined]
 def _(x: Recorded, dim: int | None = None) -> Any:
     sizes = (PICTURES, *x.whole.shape[1:])
     return sizes if dim is None else sizes[dim]
@@ -60,18 +61,6 @@ def _(x: Tensor, like: Tensor | None = None, *others: Any, **named: Any) -> Tens
     if cast.device.type != "cpu" or cast.dtype not in x.writer.dtypes:
         raise NoProgramError(f"a cast to {cast.dtype} is no instruction")
     return x
-
-
-@lowers(Tensor.squeeze, torch.squeeze)
-def _(x: Recorded, dim: int) -> Recorded:
-    if dim % x.dim() == 0 or x.shape[dim] != 1:
-        raise NoProgramError("this squeeze is no instruction")
-    return x.select(dim, 0)
-
-
-@lowers(Tensor.as_strided, torch.as_strided)
-def _(x: Recorded, *_: Any, **__: Any) -> Recorded:
-    raise NoProgramError("a view by the order in memory is no instruction")
 
 
 @lowers(Tensor.contiguous)

@@ -4,33 +4,33 @@ A recorded value is a tensor on the device "meta", with a shape and strides but 
 numbers are those of a slot of the program. What torch knows how to do with strides alone, such as
 `permute`, makes another view of the slot. Each other function has a rule here, which writes its
 instruction. Functions of darswin take part by torch's protocol for overrides.
-
-A program fits any number of pictures and any lens, but a branch in Python is taken once. So the
-number of pictures and the numbers of a lens are not shown to the network, which may compare them.
 """
 
 import inspect
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from types import FrameType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.overrides import resolve_name
 from torch.utils import _pytree as pytree
 
+from darswin.deploy.hidden import PICTURES, OfLens, refuse, unchanged
 from darswin.deploy.program import NoProgramError, Program, Slot, Weights
 from darswin.models.prepared import Prepared
 
 RULES: dict[Any, tuple[Callable[..., Any], inspect.Signature]] = {}  # lowering.py has them
-_FORM = {  # what a program knows of a value
-    Tensor.dim, Tensor.ndim.__get__, Tensor.dtype.__get__, Tensor.requires_grad.__get__,
+# What a program knows of a value.
+_FORM = (
+    Tensor.dim, Tensor.ndim.__get__, Tensor.dtype.__get__,  # type: ignore[attr-defined]
+    Tensor.requires_grad.__get__,  # type: ignore[attr-defined]
     Tensor.is_floating_point, torch.is_floating_point,
-}  # fmt: skip
+)  # fmt: skip
+# Views that depend on the order in memory, or on the number of pictures if that is one.
+_OTHER_VIEWS = (Tensor.as_strided, torch.as_strided, Tensor.squeeze, torch.squeeze)
 _RESHAPES = (Tensor.reshape, torch.reshape, Tensor.flatten, torch.flatten)
-_COUNT = 10_007  # of pictures while a program is written; no axis is as long
+_TENSORS = (Tensor, Tensor | None, Sequence[Tensor])
 
 
 def lowers(*functions: Any) -> Callable[[Callable], Callable]:
@@ -44,70 +44,6 @@ def lowers(*functions: Any) -> Callable[[Callable], Callable]:
         return rule
 
     return register
-
-
-class Pictures(int):
-    """The number of pictures. A network may make shapes of it, but not compute with it."""
-
-
-def _computes(*_: Any) -> NoReturn:
-    raise NoProgramError("a computation with the number of pictures is no instruction")
-
-
-_OPERATORS = ("add", "sub", "mul", "floordiv", "truediv", "mod", "pow", "divmod")
-for _name in (
-    "eq", "ne", "lt", "le", "gt", "ge", "bool", "int", "float", "hash", "neg", "abs",
-    *_OPERATORS, *(f"r{name}" for name in _OPERATORS),
-):  # fmt: skip
-    setattr(Pictures, f"__{_name}__", _computes)
-PICTURES = Pictures(_COUNT)
-
-
-def name_of(function: Any) -> str:
-    return resolve_name(function) or getattr(function, "__name__", str(function))
-
-
-def _refuse(function: Any, reason: object = None) -> NoReturn:
-    raise NoProgramError(
-        f"{name_of(function)} is no instruction" + (f": {reason}" if reason else "")
-    )
-
-
-def _unchanged(function: Any, run: Callable, arguments: Any, named: dict[str, Any]) -> Any:
-    """What a function returns, which must not write in the tensors that it takes."""
-    tensors = [leaf for leaf in pytree.tree_leaves((arguments, named)) if isinstance(leaf, Tensor)]
-    with torch._C.DisableTorchFunctionSubclass():
-        before = [*map(_state, tensors)]
-        result = run(arguments, named)
-        if before != [*map(_state, tensors)]:
-            _refuse(function, "it writes in place")
-    return result
-
-
-def _state(tensor: Tensor) -> tuple:
-    """What changes when a function writes in a tensor. Torch itself keeps inference tensors."""
-    version = 0 if tensor.is_inference() else tensor._version
-    return version, tensor.shape, tensor.stride(), tensor.untyped_storage()._cdata
-
-
-class OfLens(Tensor):
-    """A tensor that depends on the lens. A program has it as an input, whatever its numbers are."""
-
-    @classmethod
-    def __torch_function__(cls, function, types, arguments=(), named=None):
-        if any(issubclass(kind, Recorded) for kind in types):
-            return NotImplemented
-        if getattr(function, "__name__", "") in _NUMBERS:
-            _refuse(function, "it reads numbers that depend on the lens")
-        run = super().__torch_function__
-        return _unchanged(function, partial(run, function, types), arguments, named or {})
-
-
-# What torch makes of a tensor for Python: numbers, which may decide what comes next.
-_NUMBERS = {
-    "__bool__", "__int__", "__float__", "__complex__", "__index__", "__contains__", "__array__",
-    "item", "tolist", "numpy", "equal", "allclose", "is_nonzero",
-}  # fmt: skip
 
 
 class Recorded(Tensor):
@@ -153,14 +89,12 @@ def _by_rule(function: Any, arguments: Sequence[Any], named: dict[str, Any]) -> 
     try:
         values = signature.bind(*arguments, **named).arguments
     except TypeError as error:
-        _refuse(function, error)
+        refuse(function, error)
     for name, value in values.items():
-        kind = signature.parameters[name].annotation
-        unknown = [v for v in pytree.tree_leaves(value) if isinstance(v, (Recorded, OfLens))]
-        if not (
-            isinstance(value, Recorded) if kind is Recorded else kind in _TENSORS or not unknown
-        ):
-            _refuse(function, f"its `{name}` is another one than a program knows")
+        kind, leaves = signature.parameters[name].annotation, pytree.tree_leaves(value)
+        fits = kind in _TENSORS or not any(isinstance(v, (Recorded, OfLens)) for v in leaves)
+        if not (isinstance(value, Recorded) if kind is Recorded else fits):
+            refuse(function, f"its `{name}` is another one than a program knows")
     result = rule(*arguments, **named)
     if isinstance(result, Recorded) and result.slot is not None:
         trace, frames = result.writer, (frame for frame, _ in traceback.walk_stack(None))
@@ -168,40 +102,36 @@ def _by_rule(function: Any, arguments: Sequence[Any], named: dict[str, Any]) -> 
     return result
 
 
-_TENSORS = (Tensor, Tensor | None, Sequence[Tensor])
-
-
 def _viewed(function: Any, arguments: Sequence[Any], named: dict[str, Any]) -> Any:
     """The views that a function makes of one value. It must read and change no numbers."""
     leaves = pytree.tree_leaves((arguments, named))
-    values = [leaf for leaf in leaves if isinstance(leaf, Recorded)]
-    if len(values) != 1 or sum(isinstance(leaf, Tensor) for leaf in leaves) > 1:
-        _refuse(function)
-    (value,) = values
+    tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
+    if (
+        len(tensors) > 1
+        or not isinstance(value := tensors[0], Recorded)
+        or function in _OTHER_VIEWS
+    ):
+        refuse(function)
     if function in _FORM:
         return function(value.whole)
     arguments, named = pytree.tree_map_only(Recorded, lambda v: v.whole, (arguments, named))
     try:
-        result = _unchanged(function, lambda a, n: function(*a, **n), arguments, named)
+        result = unchanged(function, function, arguments, named)
     except NoProgramError:
         raise
     except Exception as error:
-        _refuse(function, error)
+        refuse(function, error)
     results = result if isinstance(result, (tuple, list)) else [result]
-    if not results or not all(_keeps_pictures(part, value.whole) for part in results):
-        _refuse(function)
+    for part in results:
+        if not (isinstance(part, Tensor) and part.dim() and part.shape[0] == len(value.whole)):
+            refuse(function)
     if function in _RESHAPES and not _shares(result, value.whole):
         return value.writer.copy_of(value, result)
-    if not all(_is_view(part, value.whole) for part in results):
-        _refuse(function)
+    if not results or not all(_is_view(part, value.whole) for part in results):
+        refuse(function)
     value.made()
     views = [value.writer.value(value.slot, part) for part in results]
     return views[0] if isinstance(result, Tensor) else views
-
-
-def _keeps_pictures(part: Any, whole: Tensor) -> bool:
-    """Whether a result has the pictures of a value on its first axis."""
-    return isinstance(part, Tensor) and part.dim() > 0 and part.shape[0] == len(whole)
 
 
 def _shares(part: Tensor, other: Tensor) -> bool:
@@ -247,10 +177,8 @@ class Trace:
     def __init__(self, network: nn.Module, weights: Weights, *, for_file: bool = False):
         self.program, self.for_file = Program(weights), for_file
         self._names = {id(module): name for name, module in network.named_modules()}
-        self.network, self.dtypes = (
-            network,
-            (torch.float32, getattr(network, "dtype", torch.float32)),
-        )
+        self.network = network
+        self.dtypes = torch.float32, getattr(network, "dtype", torch.float32)
         self.given: list[Tensor] = []
         self.steps: list[Made] = []
         self._inputs: dict[Any, Slot] = {}
@@ -273,7 +201,7 @@ class Trace:
 
     def filled(self, slot: Slot, order: Sequence[int] | None = None) -> Recorded:
         """A whole slot in its shape; `order`: the axes of the slot's, in the order of the value."""
-        whole = torch.empty((_COUNT, *slot.shape), device="meta")
+        whole = torch.empty((PICTURES, *slot.shape), device="meta")
         return self.value(slot, whole if order is None else whole.permute(*order))
 
     def input(self, *shape: int, order: Sequence[int] | None = None) -> Recorded:
@@ -288,7 +216,7 @@ class Trace:
             raise NoProgramError(f"{type(value).__name__} beside values is no instruction")
         with torch._C.DisableTorchFunctionSubclass():
             value = value.as_subclass(Tensor)
-        if value.dim() and len(value) == _COUNT and value.stride(0) == 0:
+        if value.dim() and value.stride(0) == 0:
             value = value[:1]  # expanded
         if value.dim() < 2 or len(value) != 1:
             raise NoProgramError(f"a tensor {tuple(value.shape)} beside pictures is no instruction")

@@ -188,7 +188,7 @@ OTHERS = [
     of_map(lambda x: x + x if x.shape[0] > 3 else x), of_map(lambda x: x if len(x) < 4 else x + x),
     of_map(lambda x: x + x if x.size(0) % 2 else x), of_map(lambda x: x + x if x.sum() > 0 else x),
     of_map(lambda x: x + x if x.numel() > 999 else x),
-    of_map(lambda x: F.gelu(x.split(4)[0] + x[:4])),
+    of_map(lambda x: F.gelu(torch.cat((x.split(4)[0], x[4:])))),
     of_map(lambda x: sum(each[None] for each in x).expand_as(x)),
     of_map(lambda x: x * x.shape[0]), of_map(lambda x: x + x if x.max().item() > 2 else x),
     of_map(lambda x: x.flip(0)), of_map(lambda x: torch.cat((x[1:], x[:1]))),
@@ -221,9 +221,12 @@ OTHERS = [
 ]  # fmt: skip
 
 
-def near(found, expected):
-    largest = expected[expected.isfinite()].abs().max().item() if expected.numel() else 0.0
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * largest, equal_nan=True)
+def near(found, expected, share=1.0):
+    """Whether this share of the numbers is equal up to rounding."""
+    assert found.shape == expected.shape and found.dtype == expected.dtype
+    atol = 1e-4 * expected.nan_to_num(0.0, 0.0, 0.0).abs().max()
+    same = torch.isclose(found, expected, rtol=1e-4, atol=atol.item(), equal_nan=True)
+    return same.float().mean() >= share
 
 
 def check(steps, folder, refuses=None):
@@ -237,10 +240,10 @@ def check(steps, folder, refuses=None):
         fast = optimize(model)
         assert not fast.lack or fast.lack.startswith("layer by layer, because of ")
         assert refuses is None or bool(fast.lack) == refuses
-        for count in (1, 3, 5):
+        share = 0.99 if fast.lack else 1.0  # a cast may round to the other side
+        for count, lens in ((1, lenses[4:]), (3, lenses[:3]), (5, lenses[:1]), (5, lenses)):
             images = torch.randn(count, 3, SIDE, SIDE)
-            for lens in (lenses[:1], lenses[:count]):
-                near(fast(images, lens), model(images, lens))
+            assert near(fast(images, lens), model(images, lens), share)
         try:
             network = network_of(model, folder, lenses[4], mean=0.5, std=0.2)
         except TypeError as error:
@@ -248,7 +251,7 @@ def check(steps, folder, refuses=None):
             return
         frame = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
         image = (torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255 - 0.5) / 0.2
-        near(torch.from_numpy(network(frame))[None], model(image, lenses[4]))
+        assert near(torch.from_numpy(network(frame))[None], model(image, lenses[4]))
 
 
 def drawn(seed):
@@ -262,7 +265,7 @@ def drawn(seed):
 @pytest.mark.parametrize("k", range(len(OTHERS)))
 def test_what_is_no_instruction_is_refused(k, tmp_path):
     torch.manual_seed(k)
-    check([OTHERS[k]()], tmp_path)
+    check([OTHERS[k]()], tmp_path, refuses=True)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +287,7 @@ def test_what_differs_is_not_used_and_named(monkeypatch):
     refused(said, optimize, model, strict=True, error=TypeError)
     images, lens = torch.randn(2, 3, SIDE, SIDE), Equidistant.from_fov(3.0, SIDE / 2)
     with torch.no_grad():
-        near(optimize(model)(images, lens), model(images, lens))
+        assert near(optimize(model)(images, lens), model(images, lens))
 
 
 def test_the_comparison_leaves_the_model_and_random_numbers_as_they_were():
