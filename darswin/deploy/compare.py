@@ -23,21 +23,21 @@ def tolerance_of(model: nn.Module) -> float:
 
 @torch.no_grad()
 def compare(
-    trace: Trace, inputs: Sequence[Tensor], pictures: Sequence[Tensor],
-    model: Callable[..., Any], layers: Callable[..., Any], tolerance: float,
+    trace: Trace, inputs: Sequence[Tensor], model: Callable[[], Any],
+    layers: Callable[..., Any], pictures: Sequence[Tensor], tolerance: float,
 ) -> None:  # fmt: skip
     """Compares a program with its model.
 
     Args:
         trace: of the program. inputs: those of the program for random pictures.
-        model, layers: what the model and its optimized layers compute of `pictures`.
+        model: computes the result for them. layers: the optimized layers, called with `pictures`.
         tolerance: the largest difference, as a part of the largest number of a result.
 
     Raises:
         NoProgramError: names the first instruction that computes something else.
     """
     try:
-        expected = model(*pictures)
+        expected = model()
     except Exception as error:
         raise NoProgramError(f"the model, which takes no random pictures: {error}") from error
     found = trace.returned(trace.program.checked()(inputs))
@@ -46,7 +46,7 @@ def compare(
         pairs = [*zip(found, expected, strict=True)]
     if not all(_near(*pair, tolerance) for pair in pairs):
         raise NoProgramError(
-            f"{_first_difference(trace, inputs, pictures, layers, tolerance)} computes something "
+            f"{_first_difference(trace, inputs, layers, pictures, tolerance)} computes something "
             "else than in the model"
         )
 
@@ -63,8 +63,8 @@ def _near(found: Any, expected: Any, tolerance: float) -> bool:
 
 
 def _first_difference(
-    trace: Trace, inputs: Sequence[Tensor], pictures: Sequence[Tensor],
-    layers: Callable[..., Any], tolerance: float,
+    trace: Trace, inputs: Sequence[Tensor], layers: Callable[..., Any],
+    pictures: Sequence[Tensor], tolerance: float,
 ) -> str:  # fmt: skip
     """The module and the function of the first instruction that differs from its function."""
     made: list[tuple[Any, Tensor]] = []
@@ -89,4 +89,4 @@ def _first_difference(
         expected = next((each for function, each in functions if function == step.function), None)
         if expected is None or not _near(of.ordered(numbers), expected, tolerance):
             return f"{step.module}: {name_of(step.function)}"
-    return f"{type(trace.network).__name__}, which"
+    return f"{type(trace.network).__name__}, as a whole,"

@@ -196,7 +196,7 @@ class OneBlock(InFloat32):
         if self.own is not None:
             return self.own(x, tables)
         if isinstance(x, Recorded):
-            raise NoProgramError(f"{type(self.other).__name__} is no instruction")
+            raise NoProgramError(f"this {type(self.other).__name__} is no instruction")
         return super().forward(x, *tables)
 
 

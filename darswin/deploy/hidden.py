@@ -65,14 +65,14 @@ def unchanged(function: Any, run: Callable, arguments: Any, named: dict[str, Any
     leaves = pytree.tree_leaves((arguments, named))
     tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
     with torch._C.DisableTorchFunctionSubclass():
-        before = [*map(_state, tensors)]
+        before = [*map(state_of, tensors)]
         result = run(*arguments, **(named or {}))
-        if before != [*map(_state, tensors)]:
+        if before != [*map(state_of, tensors)]:
             refuse(function, "it writes in place")
     return result
 
 
-def _state(tensor: Tensor) -> tuple:
+def state_of(tensor: Tensor) -> tuple:
     """What changes when a function writes in a tensor. Torch itself keeps inference tensors."""
     version = 0 if tensor.is_inference() else tensor._version
     return version, tensor.shape, tensor.stride(), tensor.untyped_storage()._cdata

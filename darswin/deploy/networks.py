@@ -132,8 +132,10 @@ class Programs:
         known = _Known(trace.program.checked(), trace, found if len(found) == len(fields) else None)
         random, count = torch.Generator().manual_seed(0), 2 * self._model.view.count
         pictures = [torch.randn(count, *shape, generator=random) for shape in shapes]
-        layers, inputs = partial(_run, self._forward, read), self._inputs(known, read, shapes)
-        compare(trace, [*pictures, *inputs], pictures, expected or layers, layers, self._tolerance)
+        inputs = [*pictures, *self._inputs(known, read, shapes)]
+        layers = partial(_run, self._forward, read)
+        model = partial(expected or layers, *pictures)
+        compare(trace, inputs, model, layers, pictures, self._tolerance)
         return known
 
     def _trace(self, prepared: Prepared, shapes: Any) -> Trace:
@@ -195,13 +197,12 @@ def frame_program(model: Any, lens: Any, size: Pair, reference: Any) -> FramePro
     words = trace.program.words()
     constants = [one.detach().float()[0].contiguous() for one in trace.given]
     frames = torch.rand(2, model.in_chans, *size, generator=torch.Generator().manual_seed(0))
-    seen = reference.sample(frames, reference.prepare(lens, size))
-    read = [] if images is None else [frames.permute(0, 2, 3, 1).contiguous()]
+    pictures = [reference.sample(frames, reference.prepare(lens, size))]
+    pictures += [] if images is None else [frames]
+    inputs = [pictures[0], *(one.permute(0, 2, 3, 1).contiguous() for one in pictures[1:])]
     compare(
-        trace, [seen, *read, *(one[None] for one in constants)], [frames],
-        lambda frames: reference(frames, lens),
-        lambda frames: layers.forward_network(seen, prepared, frames),
-        tolerance_of(reference),
+        trace, [*inputs, *(one[None] for one in constants)], partial(reference, frames, lens),
+        partial(_run, layers.forward_network, prepared), pictures, tolerance_of(reference),
     )  # fmt: skip
     classifies = isinstance(adapted(model), Encoder) and model.num_classes > 0
     finish = "probabilities" if classifies else "list" if trace.is_list else "array"

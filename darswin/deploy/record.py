@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from darswin.deploy.hidden import PICTURES, OfLens, refuse, unchanged
+from darswin.deploy.hidden import PICTURES, OfLens, refuse, state_of, unchanged
 from darswin.deploy.program import NoProgramError, Program, Slot, Weights
 from darswin.models.prepared import Prepared
 
@@ -343,11 +343,15 @@ def traced(
         pixels = (
             trace.input(*size, channels, order=(0, 3, 1, 2)) if for_file else trace.input(*images)
         )
+    own = [*network.parameters(), *network.buffers()]  # kept, so that new ones are others
+    before = [*map(state_of, own)]
     if not for_file:
         prepared = pytree.tree_map_only(Tensor, lambda t: t.as_subclass(OfLens), prepared)
     try:
         with torch.no_grad(), torch.inference_mode(False):
             trace.finish(forward(x, prepared, pixels))
+        if before != [state_of(part) for part in (*network.parameters(), *network.buffers())]:
+            raise NoProgramError("a change of its own tensors is no instruction")
     except Exception as error:  # also of the network, of values that it cannot take
         text = error if isinstance(error, NoProgramError) else f"{type(error).__name__}: {error}"
         frames = (frame for frame, _ in reversed([*traceback.walk_tb(error.__traceback__)]))
