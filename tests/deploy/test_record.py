@@ -10,7 +10,7 @@ from torch import nn
 
 from darswin import optimize
 from darswin.deploy.own import OwnLinear, OwnNorm, packed_weights
-from darswin.deploy.program import NoProgramError, Weights
+from darswin.deploy.program import Weights
 from darswin.deploy.record import traced
 from darswin.lens import Spherical
 from darswin.lens.pixels import sample_at
@@ -157,36 +157,6 @@ def test_images_beside_what_a_network_sees(for_file):
 
     want = forward(x, None, images)
     torch.testing.assert_close(run(forward, x, images, for_file=for_file), want)
-
-
-class Refused(nn.Module):
-    def __init__(self, function):
-        super().__init__()
-        self.function = function
-
-    def forward(self, x):
-        return self.function(x)
-
-
-@pytest.mark.parametrize(
-    ("function", "said"),
-    [
-        (torch.sin, "torch.sin is no instruction"),
-        (lambda x: x * 2, "mul is no instruction"),
-        (lambda x: F.conv2d(x, torch.ones(1, 3, 1, 1)), "convolution of 1 × 1"),
-        (lambda x: F.interpolate(x, (2, 2), mode="nearest"), "this interpolation, nearest"),
-        (lambda x: x + torch.ones(3, 1, 1), r"a tensor \(3, 1, 1\) beside pictures"),
-        (lambda x: F.relu(x, inplace=True), "a ReLU in place"),
-        (lambda x: F.max_pool2d(x, 2), "this pooling"),
-        (lambda x: x.mean(3), r"a mean over the axes"),
-        (lambda x: F.linear(x, torch.ones(2, 6)), "linear is no instruction"),
-        (lambda x: torch.where(x > 0, x, 0.0), "is no instruction"),
-    ],
-)
-def test_what_is_no_instruction_is_named_with_its_module(function, said):
-    network = nn.Sequential(nn.Identity(), Refused(function))
-    with pytest.raises(NoProgramError, match=rf"^1 \(Refused\): .*{said}"):
-        traced(network, lambda x, *_: network(x), Weights(), (3, 4, 6), None, None)
 
 
 @torch.no_grad()
