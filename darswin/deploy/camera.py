@@ -9,11 +9,10 @@ import torch
 from torch import nn
 
 from darswin.deploy.networks import frame_program
-from darswin.deploy.optimize import check_model, optimize
+from darswin.deploy.optimize import check_model, fast_copy, references
 from darswin.deploy.program import NoProgramError
 from darswin.frames.plans import Output, Plan, check_output, check_size
 from darswin.frames.tensor_file import check_name, write_tensors
-from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.ops.checks import check_pair, per_channel
@@ -114,10 +113,9 @@ def export_network(
     else:
         places = _every_pixel(model, size, form)
     try:
-        with torch.no_grad():
-            dtype = torch.int8 if quantized_layers(model) else torch.float32
-            fast = optimize(model, dtype)
-            program = frame_program(fast, lens, size)
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            for reference in references(model):
+                program = frame_program(fast_copy(reference), lens, size, reference)
     except NoProgramError as error:
         raise TypeError(
             f"model must be one that a file can contain, got {type(model).__name__}: {error}"

@@ -1,73 +1,106 @@
-"""The layers of optimized models, made from the layers of a model."""
+"""The layers of optimized models, made from the layers of a model.
 
-import copy
+Only a layer that is exactly one of those below, with the parts that it was made with, has a fast
+form. A subclass, or a layer with a hook or another part, stays, with fast layers in it.
+"""
+
 from collections.abc import Callable, Sequence
-from functools import partial, singledispatch
 from typing import Any
 
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from darswin.compat.official import OfficialAttention
 from darswin.deploy.own import OwnLinear, OwnNorm, own_linear, pack
-from darswin.deploy.packed import InFloat32, blocks_of, refuse_gradients
-from darswin.deploy.program import Weights
+from darswin.deploy.packed import InFloat32, InPlaceOf, OwnBlocks, refuse_gradients
+from darswin.deploy.program import NoProgramError, Weights
+from darswin.deploy.record import Recorded
+from darswin.layers.attention import PolarWindowAttention, WindowAttention
 from darswin.layers.embed import PatchEmbed, PatchProjection, PolarPatchEmbed
-from darswin.layers.position_bias import RelativeBias, joined_coefficients
+from darswin.layers.linear import Linear
 from darswin.layers.quantized import QuantizedLinear, quantized_layers
-from darswin.layers.transformer import PatchMerging, Stage
+from darswin.layers.transformer import Block, DropPath, Mlp, PatchMerging, Stage
 from darswin.models.conv_unet import ConvBlock
 from darswin.models.unet import Unet
 from darswin.views import PolarGrid
 
+_LINEAR, _NORM, _CONV = (nn.Linear, Linear, QuantizedLinear), (nn.LayerNorm,), (nn.Conv2d,)
+_ATTENTION = (WindowAttention, PolarWindowAttention, OfficialAttention)
+_BLOCK: dict[str, Sequence[type[nn.Module]]] = dict(
+    norm1=_NORM, attn=_ATTENTION, norm2=_NORM, mlp=(Mlp,), drop_path=(DropPath,)
+)
+_CONVS = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU) * 2
+# The kinds of layers that are known, and those of their parts. A position bias may be any.
+_PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {
+    **{kind: {} for kind in (*_LINEAR, *_NORM, *_CONVS, DropPath)},
+    **{kind: dict(proj=_CONV, norm=_NORM) for kind in (PatchProjection, PatchEmbed)},
+    **{kind: dict(qkv=_LINEAR, proj=_LINEAR, position_bias=()) for kind in _ATTENTION},
+    PolarPatchEmbed: dict(proj=_LINEAR, norm=_NORM),
+    PatchMerging: dict(norm=_NORM, reduction=_LINEAR),
+    ConvBlock: {str(k): (kind,) for k, kind in enumerate(_CONVS)},
+    Mlp: dict(fc1=_LINEAR, fc2=_LINEAR),
+    Block: _BLOCK,
+}
 
-@singledispatch
+
+def other_part(layer: nn.Module) -> nn.Module | None:
+    """The first part of a layer, or the layer, that is not as it is known; None if all are."""
+    parts = _PARTS.get(type(layer))
+    if parts is None or not is_plain(layer) or layer._modules.keys() != parts.keys():
+        return layer
+    for name, kinds in parts.items():
+        part = layer.get_submodule(name)
+        if kinds and (other := other_part(part) if type(part) in kinds else part) is not None:
+            return other
+    return None
+
+
+def is_plain(layer: nn.Module) -> bool:
+    """Whether a layer has no hooks, methods or options that make it another one."""
+    changed = any(callable(getattr(type(layer), name, None)) for name in vars(layer))
+    if changed or layer._forward_hooks or layer._forward_pre_hooks:
+        return False
+    if isinstance(layer, nn.LayerNorm):
+        return len(layer.normalized_shape) == 1 and layer.bias is not None
+    if isinstance(layer, nn.BatchNorm2d):
+        return layer.running_mean is not None
+    if isinstance(layer, PatchProjection) and isinstance(conv := layer.proj, nn.Conv2d):
+        sides = {*conv.kernel_size, *conv.stride}
+        return len(sides) == 1 and (conv.padding, conv.dilation, conv.groups) == ((0, 0), (1, 1), 1)
+    return True
+
+
 def fast(layer: nn.Module, weights: Weights) -> nn.Module:
-    """The layer that takes the place of another one. A kind of layer that is not registered here
-    stays, with fast layers in it."""
+    """The layer that takes the place of another one: it may be this one, with fast layers in it."""
+    if type(layer) is Stage and is_plain(layer) and _is_one_operator(layer):
+        return FastStage(layer, weights)
+    if type(layer) in FORMS and other_part(layer) is None:
+        return FORMS[type(layer)](layer, weights)
+    if isinstance(layer, Block):
+        return OneBlock(layer, weights)
     for name, part in layer.named_children():
-        layer.add_module(name, fast(part, weights))
+        if not (isinstance(layer, Unet) and name == "places"):  # these stay in float32
+            layer.add_module(name, fast(part, weights))
     return layer
 
 
-@fast.register
-def _(unet: Unet, weights: Weights) -> nn.Module:
-    for part in (unet.encoder, unet.decoder, unet.head):  # the places of tokens stay in float32
-        fast(part, weights)
-    return unet
+class FastLayer(InPlaceOf):
+    """A layer by our own operators."""
 
-
-class FastLayer(nn.Module):
-    """A layer of our own operators."""
-
-    def __init__(self, layer: OwnLinear | OwnNorm):
-        super().__init__()
-        self.layer = layer
+    def __init__(self, layer: nn.Module, own: OwnLinear | OwnNorm):
+        super().__init__(layer)
+        self.own = own
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.layer(x)
+        return self.own(x)
 
 
-@fast.register
-def _(linear: nn.Linear, weights: Weights) -> nn.Module:
-    return FastLayer(own_linear(linear))
+def _linear(layer: Any, weights: Weights) -> nn.Module:
+    if isinstance(layer, QuantizedLinear):
+        raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
+    return FastLayer(layer, own_linear(layer))
 
 
-@fast.register
-def _(layer: QuantizedLinear, weights: Weights) -> nn.Module:
-    raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
-
-
-@fast.register
-def _(norm: nn.LayerNorm, weights: Weights) -> nn.Module:
-    return FastLayer(OwnNorm(norm))
-
-
-@fast.register
-def _(conv: nn.Conv2d, weights: Weights) -> nn.Module:
-    return InFloat32(conv)
-
-
-@fast.register(PatchProjection)
 class FastProjection(nn.Module):
     """The joining of neighbours of a map, or of pixels, as a product of our own."""
 
@@ -88,15 +121,13 @@ class FastProjection(nn.Module):
         return self.norm(self.proj(x.flatten(3)))
 
 
-@fast.register
-def _(block: ConvBlock, weights: Weights) -> nn.Module:
+def _conv_block(block: ConvBlock, weights: Weights) -> nn.Module:
     conv1, norm1, _, conv2, norm2, _ = list[Any](block)
     fused = fuse_conv_bn_eval(conv1, norm1), fuse_conv_bn_eval(conv2, norm2)
     first, second = (InFloat32(conv) for conv in fused)
     return nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
 
 
-@fast.register(PolarPatchEmbed)
 class FastEmbed(nn.Module):
     """The embedding of samples."""
 
@@ -109,7 +140,6 @@ class FastEmbed(nn.Module):
         return self.norm(self.proj(x.float()))
 
 
-@fast.register(PatchMerging)
 class FastMerging(PatchMerging):
     """The merging of tokens, with our own norm and product."""
 
@@ -122,34 +152,60 @@ class FastMerging(PatchMerging):
         return self.product(self.joined(x))
 
 
-@fast.register(Stage)
-class FastStage(nn.Module):
-    """A stage, its blocks by one operator if it can be."""
+class FastStage(Stage):
+    """A stage, its blocks by one operator."""
 
     def __init__(self, stage: Stage, weights: Weights):
-        super().__init__()
+        nn.Module.__init__(self)
         self.downsample = fast(stage.downsample, weights)
-        blocks: list[Any] = list(stage.blocks)
-        if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
-            raise ValueError("both products of an MLP must be quantized, or none")
-        self.blocks = blocks_of(blocks, weights)
-        biases = [block.attn.position_bias for block in blocks]
-        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
-        self.heads = [bias.heads for bias in relative]
-        if relative:
-            self.table: Callable[[Tensor], Tensor] = partial(
-                relative[0].table, **joined_coefficients(relative)
-            )
-            self.angles = copy.deepcopy(blocks[0].attn).to("meta").angles  # it needs no weights
-        else:
-            self.constant = [bias().contiguous() for bias in biases]
+        self.own, self.blocks = OwnBlocks(list(stage.blocks), weights), stage.blocks
+        blocks: Any = stage.blocks
+        for block in blocks:  # what is left makes the position biases
+            block.norm1 = block.norm2 = block.mlp = block.attn.qkv = block.attn.proj = nn.Identity()
 
     def tables(self, grid: PolarGrid | None) -> Sequence[Tensor]:
         """As `Stage.tables`, contiguous."""
-        if not self.heads:
-            return self.constant
-        tables = self.table(self.angles(grid)).split(self.heads, 1)
-        return [table.contiguous() for table in tables]
+        return [table.contiguous() for table in super().tables(grid)]
 
     def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-        return self.blocks(self.downsample(x), tables)
+        return self.own(self.downsample(x), tables)
+
+
+def _is_one_operator(stage: Stage) -> bool:
+    """Whether the blocks of a stage are known ones of the same sizes."""
+    blocks: list[Any] = list(stage.blocks)
+    if not blocks or any(other_part(block) is not None for block in blocks):
+        return False
+    if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
+        raise ValueError("both products of an MLP must be quantized, or none")
+    sizes = {
+        (b.attn.num_heads, b.attn.map_size, b.attn.dim, b.mlp.fc1.out_features) for b in blocks
+    }
+    return type(stage.blocks) is nn.ModuleList and len(sizes) == 1
+
+
+class OneBlock(InFloat32):
+    """A block of another kind of stage, or another kind of block, which torch runs."""
+
+    def __init__(self, block: Block, weights: Weights):
+        super().__init__(block)
+        self.other = other_part(block)
+        self.own = OwnBlocks([block], weights) if self.other is None else None
+
+    def forward(self, x: Tensor, *tables: Tensor) -> Tensor:
+        if self.own is not None:
+            return self.own(x, tables)
+        if isinstance(x, Recorded):
+            raise NoProgramError(f"this {type(self.other).__name__} is no instruction")
+        return super().forward(x, *tables)
+
+
+FORMS: dict[type[nn.Module], Callable[[Any, Weights], nn.Module]] = {
+    **dict.fromkeys(_LINEAR, _linear),
+    nn.LayerNorm: lambda norm, _: FastLayer(norm, OwnNorm(norm)),
+    nn.Conv2d: lambda conv, _: InFloat32(conv),
+    **dict.fromkeys((PatchProjection, PatchEmbed), FastProjection),
+    ConvBlock: _conv_block,
+    PolarPatchEmbed: FastEmbed,
+    PatchMerging: FastMerging,
+}

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from darswin.deploy.hidden import PICTURES
 from darswin.deploy.own import OwnLinear, OwnNorm
 from darswin.deploy.packed import OwnBlocks
 from darswin.deploy.program import GELU, RELU, NoProgramError
@@ -37,21 +38,36 @@ def _(blocks: OwnBlocks, x: Recorded, tables: Sequence[Tensor]) -> Recorded:
 # -- functions between them ----------------------------------------------------------------------
 
 
+@lowers(Tensor.shape.__get__, Tensor.size)  # type: ignore[attr-defined]
+def _(x: Recorded, dim: int | None = None) -> Any:
+    sizes = (PICTURES, *x.whole.shape[1:])
+    return sizes if dim is None else sizes[dim]
+
+
 @lowers(Tensor.device.__get__)
 def _(x: Recorded) -> torch.device:
     return torch.device("cpu")  # where tensors of the lens are
 
 
-@lowers(Tensor.to, Tensor.float)
-def _(x: Tensor, *_: Any, **__: Any) -> Tensor:
-    return x if isinstance(x, Recorded) else x.float()
+@lowers(Tensor.to)
+def _(x: Tensor, like: Tensor | None = None, *others: Any, **named: Any) -> Tensor:
+    kind: Any = [torch.empty(0) if isinstance(like, Recorded) else like, *others]
+    if kind[0] is None:  # they have names
+        kind = []
+    if not isinstance(x, Recorded):
+        return x.to(*kind, **named)
+    cast = torch.empty(0).to(*kind, **named)
+    # Values have the dtype of the weights, but are computed in float32.
+    if cast.device.type != "cpu" or cast.dtype not in x.writer.dtypes:
+        raise NoProgramError(f"a cast to {cast.dtype} is no instruction")
+    return x
 
 
 @lowers(Tensor.contiguous)
 def _(x: Recorded, memory_format: torch.memory_format = torch.contiguous_format) -> Recorded:
     if memory_format != torch.contiguous_format or x.meta.is_contiguous():
         return x
-    return x.writer.copy_of(x, x.meta)
+    return x.writer.copy_of(x, x.whole)
 
 
 @lowers(Tensor.mean)
@@ -64,20 +80,22 @@ def _(x: Recorded, dim: int | Sequence[int]) -> Recorded:
 @lowers(torch.add, Tensor.add, Tensor.__add__, Tensor.__radd__)
 def _(x: Tensor, y: Tensor) -> Recorded:
     trace = next(value.writer for value in (x, y) if isinstance(value, Recorded))
-    if not (isinstance(x, Tensor) and isinstance(y, Tensor) and x.shape == y.shape):
-        raise NoProgramError("a sum of values of other shapes is no instruction")
     one, other = trace.of(x), trace.of(y)
+    if one.whole.shape != other.whole.shape:
+        raise NoProgramError("a sum of values of other shapes is no instruction")
     order = one.made().order()
     total = trace.program.added(trace.dense(one, order), trace.dense(other, order))
     return trace.filled(total, inverse(order))
 
 
 @lowers(F.gelu)
-def _(x: Recorded) -> Recorded:
+def _(x: Recorded, approximate: str = "none") -> Recorded:
+    if approximate != "none":
+        raise NoProgramError(f"an approximate GELU, {approximate}, is no instruction")
     return _applied(GELU, x)
 
 
-@lowers(F.relu)
+@lowers(F.relu, torch.relu, Tensor.relu)
 def _(x: Recorded, inplace: bool = False) -> Recorded:
     if inplace:
         raise NoProgramError("a ReLU in place is no instruction")
@@ -102,16 +120,19 @@ def _(tensors: Sequence[Tensor], dim: int = 0) -> Recorded:
     trace = next(value.writer for value in tensors if isinstance(value, Recorded))
     parts = [trace.of(value) for value in tensors]
     first, dim = parts[0], dim % parts[0].dim()
+    sizes = [part.shape[1:dim] + part.shape[dim + 1 :] for part in parts]
+    if dim == 0 or any(others != sizes[0] for others in sizes):
+        raise NoProgramError("this joining is no instruction")
     # Convolutions read maps with the channels last.
     order = [0, 2, 3, 1] if first.dim() == 4 and dim == 1 else first.made().order()
-    sizes = list(first.shape)
-    sizes[dim] = sum(part.shape[dim] for part in parts)
-    whole = trace.filled(trace.program.buffer(*(sizes[axis] for axis in order[1:])), inverse(order))
+    shape = list(first.meta.shape)
+    shape[dim] = sum(part.shape[dim] for part in parts)
+    whole = trace.filled(trace.program.buffer(*(shape[axis] for axis in order[1:])), inverse(order))
     begin = 0
     for part in parts:
-        place = trace.view(whole, whole.meta.narrow(dim, begin, part.shape[dim]))
+        place = trace.value(whole.slot, whole.whole.narrow(dim, begin, part.shape[dim]))
         begin += part.shape[dim]
-        if part.slot is None and (there := _viewed(place, part.source.shape)) is not None:
+        if part.slot is None and (there := _in_shape(place, part.source.shape)) is not None:
             part, place = part.source, there
         part.made()
         assert part.slot is not None
@@ -119,19 +140,19 @@ def _(tensors: Sequence[Tensor], dim: int = 0) -> Recorded:
     return whole
 
 
-def _viewed(place: Recorded, shape: Sequence[int]) -> Recorded | None:
+def _in_shape(place: Recorded, shape: Sequence[int]) -> Recorded | None:
     """A view in another shape, or None if its strides have none."""
     try:
-        meta = place.meta.view(shape)
+        return place.writer.value(place.slot, place.whole.view(shape))
     except RuntimeError:
         return None
-    return place.writer.view(place, meta)
 
 
 @lowers(torch.where)
 def _(condition: Tensor, x: Recorded, other: float) -> Tensor:
     """Pixels (1, K, H, W) where the condition (1, 1, H, W) is true, else 0."""
-    if isinstance(condition, Recorded) or other != 0.0:
+    shape = (1, 1, *x.shape[2:])
+    if isinstance(condition, Recorded) or condition.shape != shape or other != 0.0:
         raise NoProgramError("a choice between values is no instruction")
     if x.writer.for_file and condition.all():  # else other lenses may show less
         return x
@@ -146,7 +167,8 @@ _LAST, _FIRST = (0, 2, 3, 1), (0, 3, 1, 2)  # (1, C, H, W) as (1, H, W, C), and 
 
 
 @lowers(torch.conv2d)
-def _(x, weight, bias=None, stride=1, padding=0, dilation=1, groups=1) -> Recorded:
+def _(x: Recorded, weight: Any, bias: Any = None, stride: Any = 1, padding: Any = 0,
+      dilation: Any = 1, groups: int = 1) -> Recorded:  # fmt: skip
     size = tuple(weight.shape[2:])
     if (size, stride, padding, dilation, groups) != ((3, 3), (1, 1), (1, 1), (1, 1), 1):
         raise NoProgramError(f"this convolution of {size[0]} × {size[1]} is no instruction")
@@ -177,7 +199,9 @@ def _(images: Recorded, pixels: Tensor) -> Recorded:
 
 
 @lowers(polar_to_image)
-def _(x, radii, center, size, *, affine, points, r_max, plan, layout) -> Recorded:
+def _(x: Recorded, radii: Tensor, center: Tensor | None, size: Any, *, layout: str,
+      affine: Tensor | None, points: Tensor | None, r_max: Tensor | None, plan: Tensor | None,
+) -> Recorded:  # fmt: skip
     if plan is None:
         like = radii.new_empty((1, *x.shape[1:3], 0))
         plan = polar_to_image_plan(

@@ -9,12 +9,13 @@ from typing import Any, NoReturn, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.parametrize import is_parametrized
 
 from darswin.deploy.fast import fast
 from darswin.deploy.networks import Programs
 from darswin.deploy.program import NoProgramError, Weights
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.quantized import quantized_layers
+from darswin.layers.quantized import quantized_layers, without_quantized_layers
 from darswin.lens import Lens
 from darswin.models.adapter import adapted
 from darswin.models.base import Model
@@ -69,22 +70,50 @@ def optimize(
         model = _quantized(model, batches)
     elif batches is not None or quantized_layers(model):
         raise ValueError(f"a quantized model or batches need dtype=torch.int8, got {dtype}")
+    with torch.random.fork_rng(devices=[]):
+        made, lack = fast_copy(model), ""
+        vars(made).update(fixed_lens=lens, known={})
+        try:
+            *before, reference = references(model)
+            for each in before:
+                Programs(fast_copy(each), each, strict=strict)
+            vars(made).update(programs=Programs(made, reference, strict=strict))
+        except NoProgramError as error:
+            lack = str(error)
+    if lack and strict:
+        raise TypeError(f"model must become one program, but it runs layer by layer: {lack}")
+    vars(made).update(lack=lack and f"layer by layer, because of {lack}")
+    return made
+
+
+def references(model: Net) -> list[Net]:
+    """Copies of a model in eval mode and float32, with which its program is compared: before its
+    numbers have 8 bits, if they have, and last as it is. They share its weights."""
+    weights: Any = {id(p): nn.Parameter(p.detach(), False) for p in model.parameters()}
+    copies = [copy.deepcopy(model, weights).eval().float()]
+    if quantized_layers(model):
+        copies.insert(0, copy.deepcopy(copies[0]))
+        without_quantized_layers(copies[0])
+    return copies
+
+
+def fast_copy(model: Any) -> Any:
+    """A copy of a model with fast layers, still without programs."""
     made: Any = copy.deepcopy(model).eval().requires_grad_(False).float()
-    weights, lack = Weights(), ""
+    for part in filter(is_parametrized, [*made.modules()]):
+        values = {name: getattr(part, name).detach().clone() for name in part.parametrizations}
+        part.__class__ = type(part).__bases__[0]  # torch's own removal would change all copies
+        del part.parametrizations
+        for name, value in values.items():
+            part.register_parameter(name, nn.Parameter(value, False))
+    weights = Weights()
     fast(made, weights)
     for part in made.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
             kind = type(part)
             part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype)
-    vars(made).update(fixed_lens=lens, known={}, weights=weights)
-    try:
-        vars(made).update(programs=Programs(made, made.layers, weights))
-    except NoProgramError as error:
-        lack = str(error)
-    if lack and strict:
-        raise TypeError(f"model must become one program, but it runs layer by layer: {lack}")
-    vars(made).update(lack=lack and f"layer by layer, because of {lack}")
+    vars(made).update(weights=weights)
     return made
 
 

@@ -1,7 +1,7 @@
-"""The blocks of a stage by one operator of our own, and modules that torch runs."""
+"""The blocks of a stage by one operator of our own, and layers in place of others."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -10,12 +10,7 @@ from torch import Tensor, nn
 from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from darswin.deploy.own import PackedBlocks
-from darswin.deploy.program import Checked, NoProgramError, Program, Weights
-from darswin.deploy.record import Recorded
-from darswin.layers.attention import WindowAttention
-
-# The map of a stage, which may change, and the position biases of its blocks → the map.
-Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
+from darswin.deploy.program import Checked, Program, Weights
 
 
 class OwnBlocks(PackedBlocks):
@@ -40,29 +35,22 @@ class OwnBlocks(PackedBlocks):
         return self.program([x, *tables])[0]
 
 
-def blocks_of(blocks: Sequence[Any], weights: Weights) -> Blocks:
-    """The blocks of a stage: one operator, if all have window attention."""
-    others = [block.attn for block in blocks if not isinstance(block.attn, WindowAttention)]
-    if blocks and not others:
-        return OwnBlocks(blocks, weights)
-    layers = [InFloat32(block) for block in blocks]
-
-    def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-        if others and isinstance(x, Recorded):
-            raise NoProgramError(f"{type(others[0]).__name__} is no instruction")
-        for layer, table in zip(layers, tables, strict=True):
-            x = layer(x, table)
-        return x
-
-    return run
-
-
-class InFloat32(nn.Module):
-    """Runs a module by torch in float32, also under autocast."""
+class InPlaceOf(nn.Module):
+    """A layer in place of another one, whose attributes it has for layers around it."""
 
     def __init__(self, module: nn.Module):
         super().__init__()
         self.module = module
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return getattr(super().__getattr__("module"), name)
+
+
+class InFloat32(InPlaceOf):
+    """Runs a module by torch in float32, also under autocast."""
 
     def forward(self, x: Tensor, *others: Tensor) -> Tensor:
         refuse_gradients(x)

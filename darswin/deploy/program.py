@@ -57,15 +57,16 @@ class Weights:
         self._pieces: list[Tensor] = []
         self._offsets: dict[int, int] = {}
         self._count = 0
-        self._convs: dict[int, tuple[Tensor, Tensor]] = {}
+        self._convs: dict[tuple[int, int], tuple[Tensor, Tensor | None, Tensor]] = {}
         self._words = torch.zeros(0, dtype=torch.int32)
 
     def of_conv(self, weight: Tensor, bias: Tensor | None) -> Tensor:
         """The packed words of a convolution, the inner order of whose depth is (y, x, channel)."""
-        if id(weight) not in self._convs:
+        key = id(weight), id(bias)
+        if key not in self._convs:
             rows = weight.permute(0, 2, 3, 1).flatten(1)
-            self._convs[id(weight)] = weight, pack(rows, bias)
-        return self._convs[id(weight)][1]
+            self._convs[key] = weight, bias, pack(rows, bias)  # kept, so the ids stay theirs
+        return self._convs[key][-1]
 
     def offset(self, piece: Tensor) -> int:
         """The place of packed words of 32 bits, which are added if they are new."""

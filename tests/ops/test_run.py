@@ -14,6 +14,7 @@ from helpers import network
 
 from darswin import optimize
 from darswin.deploy.networks import frame_program
+from darswin.deploy.optimize import fast_copy
 from darswin.deploy.program import Checked
 from darswin.lens import Spherical
 
@@ -27,7 +28,7 @@ def given(name="darswin_a_nano", **options):
     lens = Spherical.from_fov(0.5, math.radians(160), size[0] / 2)
     fast = optimize(model, lens=lens)
     prepared = fast.prepare(None, size)
-    found = frame_program(optimize(model), lens, size)
+    found = frame_program(fast_copy(model), lens, size, model)
     images = torch.randn(1, 3, *size)
     inputs = [fast.sample(images, prepared)]
     inputs += [images.permute(0, 2, 3, 1)] * found.reads_frame
