@@ -10,7 +10,6 @@ from typing import Any
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from darswin.compat.official import OfficialAttention
 from darswin.deploy.own import OwnLinear, OwnNorm, own_linear, pack
 from darswin.deploy.packed import InFloat32, InPlaceOf, OwnBlocks, refuse_gradients
 from darswin.deploy.program import NoProgramError, Weights
@@ -25,7 +24,7 @@ from darswin.models.unet import Unet
 from darswin.views import PolarGrid
 
 _LINEAR, _NORM, _CONV = (nn.Linear, Linear, QuantizedLinear), (nn.LayerNorm,), (nn.Conv2d,)
-_ATTENTION = (WindowAttention, PolarWindowAttention, OfficialAttention)
+_ATTENTION = (WindowAttention, PolarWindowAttention)
 _BLOCK: dict[str, Sequence[type[nn.Module]]] = dict(
     norm1=_NORM, attn=_ATTENTION, norm2=_NORM, mlp=(Mlp,), drop_path=(DropPath,)
 )
@@ -45,14 +44,22 @@ _PARTS: dict[type[nn.Module], dict[str, Sequence[type[nn.Module]]]] = {
 
 def other_part(layer: nn.Module) -> nn.Module | None:
     """The first part of a layer, or the layer, that is not as it is known; None if all are."""
-    parts = _PARTS.get(type(layer))
+    parts = _PARTS.get(kind_of(layer))
     if parts is None or not is_plain(layer) or layer._modules.keys() != parts.keys():
         return layer
     for name, kinds in parts.items():
         part = layer.get_submodule(name)
-        if kinds and (other := other_part(part) if type(part) in kinds else part) is not None:
+        if kinds and (other := other_part(part) if kind_of(part) in kinds else part) is not None:
             return other
     return None
+
+
+def kind_of(layer: nn.Module) -> type:
+    """The class of a layer. Other `angles` make other position biases, which are inputs here."""
+    kind = type(layer)
+    while {name for name, value in vars(kind).items() if callable(value)} == {"angles"}:
+        (kind,) = kind.__bases__
+    return kind
 
 
 def is_plain(layer: nn.Module) -> bool:

@@ -230,7 +230,7 @@ class Remap:
             kind = type(picture).__name__
             raise TypeError(f"the picture must be an array or a tensor, got {kind}")
         if picture.dtype.kind in "iu" and picture.itemsize > 2:
-            raise TypeError(f"a picture of {picture.dtype} would be mixed: `target` moves ids")
+            raise TypeError(f"a picture of {picture.dtype} would be mixed: remap.target moves ids")
         picture = np.asarray(picture, picture.dtype.newbyteorder("="))  # else OpenCV misreads it
         self._check_size("picture", picture.shape[:2])
         if not picture.size:  # no channels, which neither OpenCV nor torch takes

@@ -92,7 +92,7 @@ def test_pictures_and_maps_that_do_not_fit_are_refused():
         (lambda: remap(torch.zeros(1, 3, 9, 9)), ValueError, r"picture must be .*, got \(9, 9\)"),
         (lambda: remap(torch.zeros(3, *SIZE)), ValueError, r"\(B, C, H, W\), .* pass images\[N"),
         (lambda: remap([[1, 2]]), TypeError, "the picture must be an array or a tensor, got list"),
-        (lambda: remap(np.zeros(SIZE, "i4")), TypeError, "int32 would be mixed: `target` moves"),
+        (lambda: remap(np.zeros(SIZE, "i4")), TypeError, "int32 would be mixed: remap.target"),
         (lambda: remap(np.zeros(SIZE, ">u8")), TypeError, "of >u8 would be mixed"),
         (lambda: remap.target(np.zeros((*SIZE, 3))), ValueError, r"target must be .*, got \(90"),
         (lambda: remap.back(np.zeros((8, 8))), ValueError, r"have shape \(K, h, w\), got"),
