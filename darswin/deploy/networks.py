@@ -116,7 +116,8 @@ class Programs:
             return [leaves[k].detach().float().contiguous() for k in known.fields]
         count = max((len(one) for one in leaves if isinstance(one, Tensor)), default=1)
         each = [self._trace(_of_lenses(read, k), shapes).given for k in range(count)]
-        return [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
+        rows = [torch.cat(of_lenses) for of_lenses in zip(*each, strict=True)]
+        return [row[:1] if (row == row[:1]).all() else row for row in rows]  # for several tiles
 
     def _written(self, read: Prepared, shapes: Any, expected: Any = None) -> _Known:
         """A program for what a network reads of lenses, after a comparison with two of them."""

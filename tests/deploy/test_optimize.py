@@ -12,6 +12,7 @@ from helpers import network, product, refused, relative_error
 from darswin import create_model, optimize
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import Spherical, cat
+from darswin.models.adapter import LensAdapter
 from darswin.models.base import Model
 from darswin.views import make_view
 
@@ -72,6 +73,15 @@ def test_each_lens_of_a_program_hides_its_own_pixels():
     assert bool(model.prepare(large, (64, 64)).view.shown.all())
     both, images = cat([large, small]), torch.cat((images, images))
     assert relative_error(fast(images, both), model(images, both)) < 1e-5
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("view", ["mercator", "tiles"])
+def test_each_image_of_an_adapter_has_a_lens(view):
+    model = LensAdapter(network("swin_nano"), size=32, view=view).eval()
+    images, fast = torch.randn(2, 3, 32, 32), optimize(model, strict=True)
+    for lens in (LENSES, LENSES[:1]):
+        assert relative_error(fast(images, lens), model(images, lens)) < 1e-5
 
 
 @torch.no_grad()
