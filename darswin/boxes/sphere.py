@@ -64,7 +64,7 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     ray[np.isnan(rays).all((1, 2))] = np.nan
     best, least = ray, np.full(len(ray), np.inf)
     for turn in range(33):
-        azimuth, elevation, frame, low, high = _ends(rays, ray)
+        frame, low, high = _ends(rays, ray)
         u, v = (low + high) / 2
         theta = np.hypot(u, v)
         best = np.where((theta < least)[:, None], ray, best)
@@ -76,8 +76,9 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
         aside = np.divide(np.sin(step), theta, out=np.ones(len(ray)), where=theta > 0)
         ray = (np.stack((u * aside, v * aside, np.cos(step)), -1)[:, None] @ frame)[:, 0]
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    azimuth, elevation, frame, low, high = _ends(rays, best)
+    frame, low, high = _ends(rays, best)
     ray = frame[:, 2]
+    azimuth, elevation = _angles(ray)
     width, height = high - low
     solid = 4 * np.arcsin(np.sin(width / 2) * np.sin(height / 2))
     solid[(width > np.pi) | (height > np.pi)] = np.nan
@@ -85,21 +86,23 @@ def spherical(boxes: Array, to_rays: PointMap) -> SphericalBoxes:
     return SphericalBoxes(*(like(boxes, value) for value in values))
 
 
-def _ends(
-    rays: np.ndarray, ray: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cameras that look along a ray (K, 3): their azimuth, elevation and axes, and the least and
-    the greatest angle to the right and down, (2, K) rad, of rays (K, P, 3)."""
-    azimuth = np.arctan2(ray[:, 0], ray[:, 2])
-    elevation = np.arctan2(-ray[:, 1], np.hypot(ray[:, 0], ray[:, 2]))
-    frame = _looking(azimuth, elevation)
+def _angles(ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The azimuth and the elevation of rays (K, 3), rad."""
+    x, y, z = ray.T
+    return np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z))
+
+
+def _ends(rays: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Level cameras that look along a ray (K, 3): their axes, and the least and the greatest angle
+    to the right and down, (2, K) rad, of rays (K, P, 3)."""
+    frame = _looking(*_angles(ray))
     x, y, z = np.moveaxis(rays @ frame.mT, -1, 0)
     aside = np.hypot(x, y)
     # θ, along the direction from the middle: good for angles beyond 90°.
     scale = np.divide(np.arctan2(aside, z), aside, out=np.ones(x.shape), where=aside > 0)
     angles = np.stack((x * scale, y * scale))
     low, high = np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)
-    return azimuth, elevation, frame, low, high
+    return frame, low, high
 
 
 def _looking(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

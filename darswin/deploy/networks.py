@@ -122,12 +122,9 @@ class Programs:
     def _written(self, read: Prepared, shapes: Any, expected: Any = None) -> _Known:
         """A program for what a network reads of lenses, after a comparison with two of them."""
         read = _of_lenses(read, 0, 2)
-        trace = self._trace(_of_lenses(read, 0), shapes)
-        places = {
-            identity(one): k
-            for k, one in enumerate(pytree.tree_leaves(_of_lenses(read, 0)))
-            if isinstance(one, Tensor)
-        }
+        of_lens = _of_lenses(read, 0)
+        trace, leaves = self._trace(of_lens, shapes), pytree.tree_leaves(of_lens)
+        places = {identity(one): k for k, one in enumerate(leaves) if isinstance(one, Tensor)}
         fields = [places.get(identity(one)) for one in trace.given]
         found = [k for k in fields if k is not None]
         known = _Known(trace.program.checked(), trace, found if len(found) == len(fields) else None)
