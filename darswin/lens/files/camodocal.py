@@ -8,24 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short, to_number
-from darswin.lens.files.format import Cameras, Description, Format, describe, in_image
+from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
+from darswin.lens.files.named import PLANE, RADTAN, Named
+from darswin.lens.image import Size
 from darswin.lens.polynomial import OCam, OCamInverse
 
-# The class of each model and the values in each of its sections. SCARAMUZZA has polynomials.
-DISTORTION = "k1 k2 p1 p2"
-MODELS: dict[str, tuple[type[Lens], dict[str, str]]] = {
-    "MEI": (Mei, {"projection_parameters": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
-                  "mirror_parameters": "xi", "distortion_parameters": DISTORTION}),
-    "KANNALA_BRANDT": (KannalaBrandt, {
-        "projection_parameters": "fx=mu fy=mv cx=u0 cy=v0 k1=k2 k2=k3 k3=k4 k4=k5"}),
-    "PINHOLE": (BrownConrady, {"projection_parameters": "fx fy cx cy",
-                               "distortion_parameters": DISTORTION}),
-    "SCARAMUZZA": (OCam, {}),
-}  # fmt: skip
 SECTIONS = ("mirror_parameters", "projection_parameters", "distortion_parameters",
             "poly_parameters", "inv_poly_parameters", "affine_parameters")  # fmt: skip
 BLOCKS = (
@@ -36,22 +26,40 @@ MOST_APART = 1.0  # px, between the two polynomials; the toolbox reaches about 0
 MAX_COEFFICIENTS = 64
 
 
-class CamOdoCal(Format):
+class CamOdoCal(Named):
     """One camera, called by its name in the file, or "camera"."""
 
-    name = "KITTI-360 or CamOdoCal"
-    keys = "model_type and projection_parameters"
-
     def recognizes(self, content: Content) -> bool:
-        if not isinstance(content, Mapping):
-            return False
         # OpenCV's files may have a model_type, and distortion_parameters that are a matrix.
-        sections = [key for key in SECTIONS if _is_section(content.get(key))]
-        return len(sections) + ("model_type" in content) > 1
+        return isinstance(content, Mapping) and has_several(
+            [key for key, value in content.items() if key == "model_type" or _is_section(value)],
+            self.marks,
+        )
 
-    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        name = file.text("camera_name") if "camera_name" in file else "camera"
-        return {name: partial(_camera, file)}
+    def _found(self, content: Mapping) -> list[tuple[str, Fields]]:
+        file = Fields(content)
+        return [(file.text("camera_name") if "camera_name" in file else "camera", file)]
+
+    def _described(self, camera: Fields, kind: str, size: Size) -> Description:
+        described = _scaramuzza if kind == "SCARAMUZZA" else super()._described
+        description = described(camera, kind, size)
+        # Mappings with `data` are matrices of the camera's pose, which is not used.
+        camera.check_all_read(kind, lambda _, value: _is_section(value))
+        return description
+
+
+_DISTORTION = {"distortion_parameters": RADTAN}
+CAMODOCAL = CamOdoCal(
+    "KITTI-360 or CamOdoCal", "model_type and projection_parameters", (),
+    ("model_type", *SECTIONS), ("model_type",), {
+        "MEI": (Mei, {"projection_parameters": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
+                      "mirror_parameters": "xi"} | _DISTORTION),
+        "KANNALA_BRANDT": (KannalaBrandt, {
+            "projection_parameters": "fx=mu fy=mv cx=u0 cy=v0 k1=k2 k2=k3 k3=k4 k4=k5"}),
+        "PINHOLE": (BrownConrady, {"projection_parameters": PLANE} | _DISTORTION),
+        "SCARAMUZZA": (OCam, {})},
+    "image_width image_height",
+)  # fmt: skip
 
 
 class OCamCalib(Format):
@@ -77,29 +85,11 @@ def _is_section(value: Any) -> bool:
     return isinstance(value, Mapping) and "data" not in value
 
 
-def _camera(file: Fields) -> Description:
-    expected = f"one of {', '.join(MODELS)}"
-    kind = file.text("model_type", expected).upper()
-    if kind not in MODELS:
-        raise ValueError(f"model_type must be {expected}, got {kind!r}")
-    size = (file.side("image_height"), file.side("image_width"))
-    model, sections = MODELS[kind]
-    values: dict[str, float] = {}
-    for name, names in sections.items():
-        section = file.section(name)
-        values |= section.values(names)
-        section.check_all_read(kind)
-    description = describe(model, values, size) if sections else _scaramuzza(file, size)
-    # Mappings with `data` are matrices of the camera's pose, which is not used.
-    file.check_all_read(kind, lambda _, value: _is_section(value))
-    return description
-
-
-def _scaramuzza(file: Fields, size: tuple[int, int]) -> Description:
+def _scaramuzza(file: Fields, kind: str, size: Any) -> Description:
     """OCamCalib's polynomials. The sign of a₀ tells which way the optical axis points."""
     section = file.section("affine_parameters")
     affine = section.values("cx cy c=ac d=ad e=ae")
-    section.check_all_read("SCARAMUZZA")
+    section.check_all_read(kind)
     matrix = [[affine["c"], affine["d"]], [affine["e"], 1.0]]
     direct = _polynomial(file.section("poly_parameters"))
     inverse = []

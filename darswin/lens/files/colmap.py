@@ -8,7 +8,7 @@ from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
-from darswin.lens.ideal import FieldOfView, Perspective
+from darswin.lens.ideal import FieldOfView
 from darswin.lens.sphere import EnhancedUnified
 
 # The class of each model and the order of its parameters. COLMAP, src/colmap/sensor/models/.
@@ -108,11 +108,6 @@ def _camera(row: list[str]) -> Description:
         raise ValueError(f"{where}{name} must have {len(names)} parameters, got {len(row) - 4}")
     file = Fields(dict(zip(["width", "height", *names], row[2:], strict=True)), where)
     values = file.values(order.replace("f cx", "fx=f fy=f cx"))
-    division = values.pop("division", 0.0)
-    if division:  # r / (1 + k r²) = tan θ is an EUCM
-        values |= {"alpha": 0.5, "beta": -4 * division}
-    elif "division" in names:
-        model = Perspective
     return describe(model, values, (file.side("height"), file.side("width")))
 
 

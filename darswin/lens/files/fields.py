@@ -8,7 +8,7 @@ from typing import Any
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _COEFFICIENTS = re.compile(r"^d(\d*|left|right)$|coef|(?<!un)dist(?!an[ct])")
-_COEFFICIENT = re.compile(r"[kps]\d+")
+_COEFFICIENT = re.compile(r"(cam)?[dkps]\d+")
 _YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 _MAX_WORD = 64
 MAX_SIDE = 1_000_000
@@ -114,6 +114,7 @@ class Fields:
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
         self.entries, self._where = entries, where
         self._read: set[str] = set()
+        self._sections: dict[str, Fields] = {}
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries
@@ -148,7 +149,9 @@ class Fields:
         return value
 
     def section(self, name: str) -> "Fields":
-        return Fields(self.of_kind(name, Mapping, "a mapping"), f"{self.path(name)}.")
+        """The mapping `name`, which remembers too what was read of it."""
+        entries = self.of_kind(name, Mapping, "a mapping")
+        return self._sections.setdefault(name, Fields(entries, f"{self.path(name)}."))
 
     def sections(self, name: str) -> "list[Fields]":
         expected = "a list of mappings"

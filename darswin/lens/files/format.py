@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from darswin.lens.base import MODELS, Lens
-from darswin.lens.distorted import DistortedLens
+from darswin.lens.distorted import BrownConrady, DistortedLens
 from darswin.lens.files.content import Content
 from darswin.lens.image import Size
+from darswin.lens.sphere import EnhancedUnified
 
 # For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
 # the whole sensor, and the height and width of that image, px.
@@ -106,8 +107,15 @@ def describe(model: type[Lens], values: Mapping[str, float], size: Size) -> Desc
     """The description of a camera with two focal lengths: x = fx x' + skew y' + cx.
 
     `values` are those of `PLANE`, px, where skew is optional; coefficients such as k1 and p2; and
-    the model's other numbers. Coefficients of a kind that are all zero are left out.
+    the model's other numbers. Coefficients of a kind that are all zero are left out. A FieldOfView
+    with ω = 0 and a division of 0 are pinholes.
     """
+    if division := values.get("division", 0.0):  # r / (1 + k r²) = tan θ is an EUCM
+        values = {**values, "alpha": 0.5, "beta": -4 * division}
+    elif "division" in values or values.get("omega") == 0:
+        model = BrownConrady
+    if model is EnhancedUnified:
+        values = {"beta": 1.0, **values}
     coefficients = {}
     for name, letter in LETTERS.items():
         found = {int(n[1:]): v for n, v in values.items() if re.fullmatch(rf"{letter}\d", n)}

@@ -12,12 +12,11 @@ from torch import Tensor
 
 from darswin.lens.base import Lens, from_dict, naming_degrees, with_rounded_theta_max
 from darswin.lens.files import colmap, opencv
-from darswin.lens.files.basalt import Basalt
-from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
+from darswin.lens.files.camodocal import CAMODOCAL, OCamCalib
 from darswin.lens.files.content import Content, decoded, parse, read_bytes
 from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
-from darswin.lens.files.kalibr import Kalibr
+from darswin.lens.files.named import BASALT, KALIBR, NEIGHBOURS
 from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.unknown import program_of, unknown
@@ -32,7 +31,7 @@ MAX_CAMERAS = 10_000
 
 # The first one that fits a file reads it.
 FORMATS: tuple[Format, ...] = (
-    Own(), WoodScape(), Basalt(), Nerfstudio(), CamOdoCal(), Kalibr(), opencv.ByName(),
+    Own(), WoodScape(), BASALT, Nerfstudio(), CAMODOCAL, KALIBR, *NEIGHBOURS, opencv.ByName(),
     opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
 _UNKNOWN = "unknown format: {}. The formats are " + ", ".join(format.name for format in FORMATS)

@@ -12,14 +12,14 @@ from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.format import Format
-from darswin.lens.files.kalibr import Kalibr
+from darswin.lens.files.named import KALIBR
 from darswin.lens.files.own import Own
 from darswin.lens.fitting import Fit, fit, largest_distance
 from darswin.utils.files import replace_file
 
 # The formats that `save` writes.
 WRITTEN: dict[str, Format] = {
-    "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": Kalibr()
+    "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": KALIBR
 }  # fmt: skip
 
 
