@@ -1,6 +1,7 @@
 """The content of a YAML, JSON, XML, .npz or plain text file. Nothing in a file is executed, and
 large files end in an error instead of a long wait."""
 
+import base64
 import io
 import json
 import os
@@ -31,7 +32,14 @@ MAX_ARRAYS = 256
 
 # The corner points of a calibration, in YAML and in XML: megabytes of numbers that no lens needs.
 _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
-
+# A matrix of OpenCV in base64, in JSON, YAML and XML: 24 bytes that name its type, then numbers.
+_BASE64 = re.compile(
+    r'"\$base64\$([^"]*)"|!!binary \|((?:\s+[\w+/]+=*(?=\s|\Z))*)|(?<=type_id="binary">)([^<]*)'
+)
+_TYPES = dict(zip("ucwsihfd", ("u1", "i1", "<u2", "<i2", "<i4", "<f2", "<f4", "<f8"), strict=True))
+_SENSOR = re.compile(r"^[^,\n#]*,[^,\n]*, *camera *,", re.MULTILINE)  # of kapture
+# mrcal's models hold the state of their calibration, which is large.
+_STATE = re.compile(r"(?<=: )b'[^'\n]*'")
 
 # The first bytes of files that are given in place of a calibration. None begins a cameras.bin.
 _OTHERS = {
@@ -109,16 +117,21 @@ def _from_npz(data: bytes) -> str:
 
 def parse(text: str) -> Content:
     """The mapping or table in a text. Its first characters tell the notation."""
+    text = _BASE64.sub(_from_base64, text)
     start = text.lstrip()
     if not start:
         raise ValueError("it must not be empty")
     try:
-        if start[0] == "{":
-            return _parse_json(text)
         if start[0] == "<":
             return _parse_xml(start)
-        lines = (line.lstrip() for line in text.splitlines())
+        if start[0] == "{" and start[1:].lstrip()[:1] not in ("'", "#"):  # mrcal writes Python
+            return _parse_json(text)
+        if _SENSOR.search(text):
+            return _parse_sensors(text)
+        lines = (line.strip() for line in text.splitlines())
         first = next((line for line in lines if line and line[0] != "#"), "-")
+        if first == "[image]":
+            return _parse_ost(text)
         return _parse_table(text) if is_number(first.split()[0]) else _parse_yaml(text)
     except RecursionError as error:
         raise ValueError("its entries are nested too deeply") from error
@@ -136,11 +149,33 @@ def _parse_table(text: str) -> list[list[str]]:
     return [row for row in rows if row and row[0][0] != "#"]
 
 
+def _parse_sensors(text: str) -> list[list[str]]:
+    """The cameras of kapture's sensors.txt, as rows of COLMAP."""
+    lines = _limited("a table", text, MAX_TABLE).splitlines()
+    rows = ([word.strip() for word in line.split(",")] for line in lines if line[:1] != "#")
+    return [[row[0], *row[3:]] for row in rows if row[2:3] == ["camera"]]
+
+
+def _parse_ost(text: str) -> Mapping:
+    """ROS's ost.txt: names, each with numbers in the lines below. A pair repeats the size, and its
+    sections tell the side."""
+    side, blocks = "", [("", list[str]())]
+    for words in _parse_table(text):
+        if words[0][0] == "[":
+            side = words[0].strip("[]").partition("/")[2]
+        elif is_number(words[0]):
+            blocks[-1][1].extend(words)
+        else:
+            blocks.append((" ".join(words) + side, []))
+    return mapping({str(block): block for block in blocks}.values())
+
+
 def _parse_yaml(text: str) -> Mapping:
     """Parses YAML. Scalars stay text, and tags such as !!opencv-matrix are ignored. Of several
     documents, as `rostopic echo` writes them, all must be the same but for their header."""
     # OpenCV begins its files with %YAML:1.0, which is not valid YAML.
-    text = re.sub(r"\A%YAML[^\n]*\n", "", _limited("YAML", text, MAX_YAML))
+    text = _STATE.sub("''", re.sub(r"\A%YAML[^\n]*\n", "", text))
+    text = _limited("YAML", text, MAX_YAML)
     lines = text.split("\n")
     while lines and lines[-1].strip() in ("", "---", "..."):  # `ros2 topic echo` ends like this
         lines.pop()
@@ -206,6 +241,19 @@ def _element(element: ElementTree.Element, depth: int, is_opencv: bool) -> Mappi
     for tag, value in children:
         found.setdefault(tag, []).append(value)
     return {tag: values[0] if len(values) == 1 else values for tag, values in found.items()}
+
+
+def _from_base64(match: re.Match) -> str:
+    """The numbers of a matrix as text; the match if it is none, or one that no lens needs."""
+    words = next(group for group in match.groups() if group is not None)
+    try:
+        data = base64.b64decode("".join(words.split()), validate=True)
+        kind = _TYPES[data[:24].decode().strip().lstrip("0123456789")]
+        numbers = np.frombuffer(data[24:], kind).tolist()
+    except (ValueError, KeyError):
+        return match[0]
+    text = " ".join(map(repr, numbers)) if len(data) <= MAX_ARRAY else "many numbers"
+    return text if match[3] is not None else f'"{text}"'
 
 
 def _limited(notation: str, text: str, most: int) -> str:

@@ -93,7 +93,7 @@ def to_flag(value: Any, name: str) -> bool:
 
 def plain_name(name: str) -> str:
     """A name in lower case without separators, in which programs spell names differently."""
-    return name.lower().replace("_", "").replace("-", "").replace(" ", "")
+    return re.sub(r"[\W_]+", "", name.lower())
 
 
 def like_coefficients(name: str, value: Any) -> bool:

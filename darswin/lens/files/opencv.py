@@ -1,6 +1,6 @@
 """Camera matrices and their coefficients: OpenCV's FileStorage and ROS's camera_info.
 
-Files are YAML, XML or JSON. The keys of several cameras end with 1 and 2, or left and right.
+Files are YAML, XML or JSON. The keys of several cameras end with a number, or left and right.
 Intrinsics may also be single numbers: fx, fy, cx, cy, and k1, k2, p1, … beside them.
 """
 
@@ -18,6 +18,7 @@ from darswin.lens.files.content import Content
 from darswin.lens.files.fields import (
     Fields,
     holds_numbers,
+    is_number,
     like_coefficients,
     listed,
     plain_name,
@@ -63,7 +64,7 @@ WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
 SAYS_MODEL = ("distortionmodel", "model", "cameramodel", "modeltype", "calibrationmodel")
 BESIDE = (*COEFFICIENTS, *SIZE, *SHAPE, *WIDTH, *HEIGHT, *SAYS_FISHEYE, *SAYS_MODEL, "xi")
-SUFFIXES = ("0", "1", "2", "3", "left", "right")
+SUFFIX = r"\d+|left|right"
 
 
 class OpenCV(Format):
@@ -83,19 +84,19 @@ class OpenCV(Format):
         # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
         names = {plain_name(name): value for name, value in content.items()}
         return any(
-            _is_matrix(value := names.get(matrix + end))
+            _is_matrix(value)
             or (
                 (isinstance(value, (list, Mapping)) or " " in str(value or ""))
                 and any(name + e in names for name in BESIDE for e in {end, ""})
             )
-            for matrix in MATRIX
-            for end in ("", *SUFFIXES)
+            for end, value in _matrices(names)
         )
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        reader = _Reader(file, coefficients)
-        suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
-        if reader.find(MATRIX) is not None:
+        reader = Reader(file, coefficients)
+        values = {plain: file.entries[name] for plain, name in reader.names.items()}
+        suffixes = sorted({end for end, _ in _matrices(values)}, key=lambda end: (len(end), end))
+        if "" in suffixes:
             suffixes = [""]
         reader.check_coefficients(suffixes)
         return {suffix or "camera": partial(reader.camera, suffix) for suffix in suffixes}
@@ -153,17 +154,17 @@ class ByName(Format):
         )
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        reader = _Reader(file, coefficients)
+        reader = Reader(file, coefficients)
         if reader.coefficients("") is None or any(
             re.fullmatch(r"[kps]\d|skew", n) for n in reader.names
         ):
             return {"camera": reader.camera_by_name}
         fx, fy, cx, cy = (file.number(reader.names[name]) for name in PLANE)
         whole = {**file.entries, "camera_matrix": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
-        return {"camera": partial(_Reader(Fields(whole), coefficients).camera, "")}
+        return {"camera": partial(Reader(Fields(whole), coefficients).camera, "")}
 
 
-class _Reader:
+class Reader:
     """A file whose entries have various names, and the model that the user named."""
 
     def __init__(self, file: Fields, given: str | None):
@@ -215,10 +216,10 @@ class _Reader:
             form = "[fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0"
             raise ValueError(f"{matrices[0]} must be {form}, got {values[0]}")
         plane = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
-        name = self.coefficients(suffix)
+        name, xi = self.coefficients(suffix), self.find(("xi",), suffix)
+        kind = self.given or self.says(suffix)  # before the numbers: each model has its own
         coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14), 4)
-        xi = self.find(("xi",), suffix)
-        kind = self.kind(name, coefficients, xi)
+        kind = kind or self.kind(name, coefficients, xi)
         says = xi is not None or self.find(SAYS_FISHEYE + SAYS_MODEL) is not None
         if name is None and (says or self.given is None):
             raise ValueError(
@@ -260,7 +261,7 @@ class _Reader:
         elif any(name[0] != "k" for name in found):
             only = "pinhole"
         # The names of coefficients tell the model; their number, as in a list, does not.
-        kind = self.kind(listed(terms), [*terms.values()][:1], xi, only)
+        kind = self.given or self.says() or self.kind(listed(terms), [*terms.values()][:1], xi, only)
         model, order, _ = ORDERS[kind]
         # OpenCV calls the denominator's coefficients k4 to k6.
         ours = {"k4": "d1", "k5": "d2", "k6": "d3"} if kind == "pinhole" else {}
@@ -281,25 +282,27 @@ class _Reader:
         file.check_all_read(f"the {kind} model", like_coefficients)
         return describe(model, values, self.image_size("", (plane["cx"], plane["cy"])))
 
-    def kind(
-        self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
-    ) -> str:
-        """One of `MODELS`: the user's, the file's, or the only one with such coefficients."""
-        if self.given is not None:
-            return self.given
-        if (flag := self.find(SAYS_FISHEYE)) is not None:
-            return "fisheye" if to_flag(self.file.entries[flag], flag) else "pinhole"
-        if (entry := self.find(SAYS_MODEL)) is not None:
-            word = plain_name(self.file.text(entry))
-            found = next((kind for kind, words in WORDS.items() if word in words), None)
-            if found is None:
+    def says(self, suffix: str = "") -> str | None:
+        """The one of `MODELS` that the file names for a camera, or for all; None if it does not."""
+        for end in (suffix, ""):
+            if (flag := self.find(SAYS_FISHEYE, end)) is not None:
+                return "fisheye" if to_flag(self.file.entries[flag], flag) else "pinhole"
+            if (entry := self.find(SAYS_MODEL, end)) is not None:
+                word = plain_name(self.file.text(entry))
+                if found := [kind for kind, words in WORDS.items() if word in words]:
+                    return found[0]
                 known = ", ".join(sorted(word for words in WORDS.values() for word in words))
                 text = (
                     f"{entry} must be one of {known}, got {short(self.file.entries[entry])}; else "
                     f"choose with `coefficients` one of {', '.join(MODELS)}"
                 )
                 raise naming(ValueError(text), "coefficients")
-            return found
+        return None
+
+    def kind(
+        self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
+    ) -> str:
+        """The only one of `MODELS` with such coefficients."""
         if xi is not None:
             return "omnidir"
         if only is not None or len(coefficients) > 4:
@@ -352,7 +355,7 @@ class _Reader:
         the center's ratio of x to y, as beside the matrix of a smaller image."""
         value = self.file.entries[name]
         if isinstance(value, Mapping) and "data" not in value:
-            both = _Reader(self.file.section(name), None)
+            both = Reader(self.file.section(name), None)
             return both.side(both.find(HEIGHT) or "height"), both.side(both.find(WIDTH) or "width")
         sides = self.matrix(name, (2, 3))
         first, second = (to_side(side, f"{name}[{i}]") for i, side in enumerate(sides[:2]))
@@ -371,10 +374,16 @@ class _Reader:
         return self.file.side(name)
 
 
+def _matrices(names: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """The ending of each name of a matrix, and its value. Single numbers, as k1, are no matrix."""
+    found = [(re.fullmatch(rf"({'|'.join(MATRIX)})({SUFFIX})?", n), v) for n, v in names.items()]
+    return [(m[2] or "", v) for m, v in found if m and not is_number(str(v))]
+
+
 def _is_once(plain: str) -> bool:
     """True for the names of one number or size, of which two values cannot both be right."""
     once = "|".join((*PLANE, *SIZE, *SHAPE, *WIDTH, *HEIGHT, "[kps]\\d"))
-    return re.fullmatch(rf"({once})({'|'.join(SUFFIXES)})?", plain) is not None
+    return re.fullmatch(rf"({once})({SUFFIX})?", plain) is not None
 
 
 def _plain_value(value: Any) -> Any:
