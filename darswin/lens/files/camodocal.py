@@ -66,7 +66,7 @@ class OCamCalib(Format):
     """Rows of numbers for one camera."""
 
     name = "OCamCalib"
-    keys = "5 lines of numbers, as calib_results.txt"
+    keys = f"the lines of calib_results.txt ({', '.join(BLOCKS)})"
     is_table = True
 
     def recognizes(self, content: Content) -> bool:

@@ -1,5 +1,6 @@
 """transforms.json of nerfstudio and instant-ngp: one camera for all frames, or one for each."""
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -14,6 +15,7 @@ from darswin.lens.files.fields import (
     plain_name,
     short,
     to_flag,
+    to_number,
 )
 from darswin.lens.files.format import Cameras, Description, Format, describe, has_several
 from darswin.lens.files.opencv import SAYS_FISHEYE
@@ -24,7 +26,8 @@ MODELS = {
 }  # fmt: skip
 TERMS: tuple[str, ...] = ("k1", "k2", "k3", "k4", "p1", "p2")
 MARKS = ("frames", "fl_x", "fl_y", "transform_matrix", "camera_angle_x")
-KEYS = ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
+ANGLES = ("camera_angle_x", "camera_angle_y")
+KEYS = ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *ANGLES, *TERMS)
 # Entries of instant-ngp, after `plain_name`, that name cameras which we do not read.
 OTHERS = re.compile(r"ftheta.*|(is)?(latlong|equirectangular|orthographic|spherical|panorama)")
 PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # nerfstudio's tools write both or none
@@ -42,7 +45,8 @@ class Nerfstudio(Format):
             return False
         frames = content.get("frames")
         first = frames[0] if isinstance(frames, list) and frames else None
-        return has_several([*content, *(first if isinstance(first, Mapping) else ())], MARKS)
+        keys = {*content, *(first if isinstance(first, Mapping) else ())}
+        return has_several(keys, MARKS) or {ANGLES[0], "w", "h"} <= keys
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         frames = file.get("frames", "a list of mappings") if "frames" in file else []
@@ -52,6 +56,7 @@ class Nerfstudio(Format):
         # overrides all coefficients of the frames.
         shared = {key: file.entries[key] for key in _of_camera(file.entries)}
         hidden = {*shared, *(TERMS if any(key in shared for key in TERMS) else ())}
+        hidden |= {*ANGLES} if "fl_x" in shared else set()
         own = _of_camera(set().union(*frames)) - hidden
         if not own:
             return {"camera": partial(_camera, file)}
@@ -106,6 +111,24 @@ def _camera(fields: Fields) -> Description:
         if len(there) == 1:
             lacks = fields.path(*({*pair} - {*there}))
             raise ValueError(f"{fields.path(there[0])} needs {lacks}: write 0 if there is none")
-    values = fields.values("fx=fl_x fy=fl_y cx cy") | fields.values(" ".join(terms), 0.0)
+    if ANGLES[0] in fields and "fl_x" not in fields:
+        values = _of_angles(fields)
+    else:
+        values = fields.values("fx=fl_x fy=fl_y cx cy")
+    values |= fields.values(" ".join(terms), 0.0)
     fields.check_all_read(f"nerfstudio's {model}", like_coefficients)
     return describe(MODELS[model], values, size)
+
+
+def _of_angles(fields: Fields) -> dict[str, float]:
+    """Focal lengths from fields of view, with the principal point in the image's middle if the
+    file does not say it."""
+    values = {"cx": fields.number("cx", fields.side("w") / 2)}
+    values["cy"] = fields.number("cy", fields.side("h") / 2)
+    expected = "above 0 and below π rad"
+    for key, side, name in zip(ANGLES, ("w", "h"), ("fx", "fy"), strict=True):
+        if key in fields:
+            angle = to_number(fields.get(key, expected), fields.path(key), expected,
+                              lambda angle: 0 < angle < math.pi)  # fmt: skip
+            values[name] = fields.side(side) / 2 / math.tan(angle / 2)
+    return {"fy": values["fx"]} | values

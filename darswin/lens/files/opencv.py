@@ -377,7 +377,10 @@ class Reader:
 def _matrices(names: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """The ending of each name of a matrix, and its value. Single numbers, as k1, are no matrix."""
     found = [(re.fullmatch(rf"({'|'.join(MATRIX)})({SUFFIX})?", n), v) for n, v in names.items()]
-    return [(m[2] or "", v) for m, v in found if m and not is_number(str(v))]
+    return [
+        (m[2] or "", v) for m, v in found
+        if m and (isinstance(v, (list, Mapping)) or not is_number(str(v)))
+    ]  # fmt: skip
 
 
 def _is_once(plain: str) -> bool:

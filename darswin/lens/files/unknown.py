@@ -12,11 +12,14 @@ from darswin.utils.nearest import nearest
 _MOST = 20  # entries that are compared
 _LOOKED_AT = 1 << 20  # characters
 _FOR_OPENCV, _FOR_COLMAP = (f"let it write the cameras for {to}" for to in ("OpenCV", "COLMAP"))
+_BY_NAME = "write its numbers by name, as fx, fy, cx, cy, k1, … beside width, height and model"
 # Other programs, the names that all of their files have, and what to do.
 PROGRAMS = (
     ("PhotonVision", r'"cameraIntrinsics" "distCoeffs"', "write its matrix, coefficients and "
      "resolution as OpenCV's"),
-    ("mrcal", "lensmodel LENSMODEL_", "mrcal-to-kalibr converts it"),
+    ("mrcal", r"LENSMODEL_(?!PINHOLE\b|OPENCV(?:4|5|8|12)\b)\w+", "mrcal-convert-lensmodel "
+     "LENSMODEL_OPENCV8 writes one that can be read"),
+    ("OCamCalib for MultiCol", r"\bCamera\.nrpol: \bCamera\.a0:", "write calib_results.txt"),
     ("MATLAB", "RadialDistortion TangentialDistortion", "cameraIntrinsicsToOpenCV converts it"),
     ("MATLAB", "MappingCoefficients StretchMatrix", "write it as an OCam lens of darswin, whose "
      "pixels begin at 0"),
@@ -28,6 +31,7 @@ PROGRAMS = (
     ("Meshroom", '"views" "intrinsics" "poses"', _FOR_COLMAP),
     ("OpenSfM", '"projection_type" "focal', _FOR_COLMAP),
     ("Kalibr's report", r"Camera-system\sparameters:", "take the camchain file beside it"),
+    ("Kalibr's report", r"^Calibration\sresults ^Reprojection\serror", "take the camchain file"),
     ("Kalibr's boards", r"\btarget_type: \b(?:tag|target)Cols:", "take the camchain file"),
     ("ORB-SLAM", r"\bCamera\d?\.fx \bCamera\d?\.cx", "write its numbers as OpenCV's"),
     ("stella_vslam", r"^Camera: \bsetup: \bcolor_order:", "write its numbers as OpenCV's"),
@@ -41,6 +45,14 @@ PROGRAMS = (
      "OpenCV's"),
     ("Gyroflow", '"fisheye_params" "calib_dimension"', "write its matrix, coefficients and size "
      "as OpenCV's"),
+    ("maplab or SVO", r"\bcameras: \bcamera: \bintrinsics:", "write T_B_C beside each camera"),
+    ("iKalibr", r"\bpolymorphic_name\b \bptr_wrapper\b \bdisto_param\b", _BY_NAME),
+    ("Isaac Sim", r"\bomni:lensdistortion:\w+", _BY_NAME),
+    ("COLMAP's rigs", '"image_prefix" "cameras"', "take cameras.txt beside it"),
+    ("DSO or 4Seasons", r"\A\s*(?:(Pinhole|FOV|RadTan|EquiDistant|KannalaBrandt)\s+[-+.\d]|"
+     r"(?:[-+.\de]+\s+){6,16}(crop|full|none)\b)", _BY_NAME),
+    ("fisheye-calib-adapter", "^image: ^parameter:", _BY_NAME),
+    ("BoofCV", "^pinhole: ^model:", _BY_NAME),
     ("ROS bags", "rosbag2_bagfile_information", "take the camera_info message in the bag"),
 )  # fmt: skip
 
@@ -62,7 +74,9 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
     """What a file of an unknown format holds, and what was expected."""
     if isinstance(content, list):
         tables = " or ".join(format.keys for format in formats if format.is_table)
-        return f"it is a table of {len(content)} lines, but a table must have {tables}"
+        counts = {len(row) for row in content}
+        words = " to ".join(map(str, sorted({min(counts), max(counts)})))
+        return f"it is a table of {len(content)} lines of {words} words, but must have {tables}"
     found = f"its entries are {listed(content) or 'none'}"
     given = content.get("model")
     if isinstance(given, str):
@@ -75,5 +89,6 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
         return sum(bool(nearest(name, words)) for name in names)
 
     best = max(keys, key=score)
-    expected = keys[best] if score(best) else f'{keys["OpenCV"]}, or a "model" of darswin'
+    is_near = score(best) > 1 and 2 * score(best) >= len(names)
+    expected = keys[best] if is_near else f'{keys["OpenCV"]}, or a "model" of darswin'
     return f"{found}, but expected are, for example, {expected}"
