@@ -193,12 +193,13 @@ class Fields:
         return self.of_kind(name, str, expected)
 
     def one_of(self, name: str, allowed: Iterable[str]) -> str:
-        allowed = tuple(allowed)
-        expected = f"one of {', '.join(allowed)}"
+        """One of several words, which programs spell differently, in our spelling."""
+        words = {plain_name(word): word for word in allowed}
+        expected = f"one of {', '.join(words.values())}"
         value = self.text(name, expected)
-        if value not in allowed:
+        if plain_name(value) not in words:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
-        return value
+        return words[plain_name(value)]
 
     def numbers(self, name: str, counts: tuple[int, ...], least: int | None = None) -> list[float]:
         """A list of numbers, from a list or from text with spaces; `counts` are the valid lengths.

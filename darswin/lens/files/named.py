@@ -14,7 +14,7 @@ import yaml
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, like_coefficients, plain_name, short
+from darswin.lens.files.fields import Fields, holds_numbers, like_coefficients, short
 from darswin.lens.files.format import (
     Cameras,
     Description,
@@ -32,10 +32,9 @@ from darswin.utils.text import mapping
 # these names, those of a list this order. The entry "" is the camera itself.
 Kinds = dict[str, tuple[type[Lens], dict[str, str]]]
 PLANE, RADTAN = "fx fy cx cy", "k1 k2 p1 p2"
+RADTANS = ("radtan", "radial-tangential")  # Kalibr's word and others'
 EIGHT = f"{RADTAN} k3 d1 d2 d3"
 KEY = "the model"  # the name of a camera's entry in the mapping around it
-SAME = {"radialtangential": "radtan", "radialtangential8": "radtan8", "plumbbob": "radtan",
-        "plumbbob8": "radtan8"}  # fmt: skip  # after `plain_name`
 
 
 @dataclass(eq=False)
@@ -49,7 +48,7 @@ class Named(Format):
         words: the entries that together name the model, as the keys of `kinds` do. KEY is the
             camera's own name.
         size: the entry with the width and the height, which may be missing; or an entry for each.
-        label: the entry with the camera's name, if any; else its name in the mapping around it.
+        label: the entry with the camera's name, if it has one.
         others: entries whose numbers are not used.
     """
 
@@ -60,7 +59,7 @@ class Named(Format):
     words: tuple[str, ...]
     kinds: Kinds
     size: str
-    label: str = ""
+    label: str = KEY
     others: tuple[str, ...] = ()
 
     def recognizes(self, content: Content) -> bool:
@@ -79,19 +78,21 @@ class Named(Format):
                 if isinstance(entry, Mapping) and not {*self.marks[:2]}.isdisjoint({KEY, *entry})
             ]  # fmt: skip
             if any(self.marks[0] in e and has_several(e, self.marks) for _, e in found):
-                return [(self._label(e), Fields(e, path and f"{path}.")) for path, e in found]
+                names = ([*_places(e, self.label), *_places(e, KEY)][0][-1] for _, e in found)
+                fields = (Fields(entry, path and f"{path}.") for path, entry in found)
+                return [*zip(map(str, names), fields, strict=True)]
         return []
-
-    def _label(self, entry: Mapping) -> str:
-        labels = [str(label) for *_, label in _places(entry, self.label or KEY)]
-        return labels[0] if labels else entry[KEY]
 
     def _camera(self, camera: Fields) -> Description:
         words: list[str] = []
         for path in self.words:
             kinds = [kind.split() for kind in self.kinds]
             allowed = dict.fromkeys(k[len(words)] for k in kinds if k[: len(words)] == words)
-            words.append(_word(camera, path, [*allowed]))
+            if "/" in path and "none" in allowed and not [*_places(camera.entries, path)]:
+                words.append("none")  # maplab leaves the distortion out
+            else:
+                holder, name = _holder(camera, path)
+                words.append(holder.one_of(name, allowed))
         return self._described(camera, " ".join(words), self._size(camera))
 
     def _size(self, camera: Fields) -> Size:
@@ -105,17 +106,25 @@ class Named(Format):
         what, values = f"a {kind} camera", dict[str, float]()
         holders = [camera]
         for path, names in entries.items():
+            if path and not names:  # without distortion
+                there = [v["data"] if isinstance(v, Mapping) and "data" in v else v
+                         for *_, v in _places(camera.entries, path)]  # fmt: skip
+                if any(map(holds_numbers, there)):
+                    text = f"{what} does not use the numbers of {path.replace('/', '.')}"
+                    raise ValueError(text)
+                continue
             holder, name = _holder(camera, path)
             value = holder.entries.get(name)
             if isinstance(value, Mapping) and "data" in value:  # a matrix
                 holder, name = holder.section(name), "data"
             if not name:
                 values |= holder.values(names)
+                holder.check_all_read(what, lambda name, _: KEY in self.words)
             elif isinstance(value, Mapping) and name != "data":
                 section = holder.section(name)
                 values |= section.values(names)
                 section.check_all_read(what, lambda name, _: name not in self.others)
-            elif names:
+            else:
                 values |= _in_order(holder, name, names, model)
             holders.append(holder)
         for holder in holders:
@@ -157,23 +166,10 @@ def _holder(camera: Fields, path: str) -> tuple[Fields, str]:
     return camera, next((name for name in names.split("|") if name in camera), names.split("|")[0])
 
 
-def _word(camera: Fields, path: str, allowed: list[str]) -> str:
-    """The word of an entry that names a model, in our spelling."""
-    if "none" in allowed and "/" in path and not list(_places(camera.entries, path)):
-        return "none"  # maplab leaves the distortion out
-    holder, name = _holder(camera, path)
-    expected = f"one of {', '.join(allowed)}"
-    plain = plain_name(word := holder.text(name, expected))
-    found = {plain_name(word): word for word in allowed}.get(SAME.get(plain, plain))
-    if found is None:
-        raise ValueError(f"{holder.path(name)} must be {expected}, got {short(word)}")
-    return found
-
-
 def _pinholes(plane: str, terms: str, fov: str) -> Kinds:
     """Pinholes by the words for their distortion, with the coefficients in their own entry."""
     return {
-        "radtan": (BrownConrady, {plane: PLANE, terms: RADTAN}),
+        **dict.fromkeys(RADTANS, (BrownConrady, {plane: PLANE, terms: RADTAN})),
         "equidistant": (KannalaBrandt, {plane: PLANE, terms: "k1 k2 k3 k4"}),
         fov: (FieldOfView, {plane: PLANE, terms: "omega"}),
         "none": (BrownConrady, {plane: PLANE, terms: ""}),
@@ -272,9 +268,9 @@ NEIGHBOURS = (
         ("distortion_type",), {
             word: (model, {"focal_length": "fx fy", "principal_point": "cx cy",
                            "distortion_coefficients": terms})
-            for word, model, terms in (("radtan", BrownConrady, RADTAN),
+            for word, model, terms in (("radialtangential", BrownConrady, RADTAN),
                                        ("equidistant", KannalaBrandt, "k1 k2 k3 k4"),
-                                       ("radtan8", BrownConrady, EIGHT))},
+                                       ("radialtangential8", BrownConrady, EIGHT))},
         "image_dimension",
     ),
     Named(
@@ -282,7 +278,7 @@ NEIGHBOURS = (
         ("camera", "T_B_C"), ("camera/type", "camera/distortion/type"),
         {f"pinhole {word}": kind for word, kind in _pinholes(
             "camera/intrinsics", "camera/distortion/parameters", "fisheye").items()} | {
-            "unified-projection radtan": (Mei, {"camera/intrinsics": f"xi {PLANE}",
+            "unified-projection radial-tangential": (Mei, {"camera/intrinsics": f"xi {PLANE}",
                                                 "camera/distortion/parameters": RADTAN}),
             "unified-projection none": (Mei, {"camera/intrinsics": f"xi {PLANE}"})},
         "camera/image_width camera/image_height", "camera/label",

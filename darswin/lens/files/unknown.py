@@ -12,7 +12,7 @@ from darswin.utils.nearest import nearest
 _MOST = 20  # entries that are compared
 _LOOKED_AT = 1 << 20  # characters
 _FOR_OPENCV, _FOR_COLMAP = (f"let it write the cameras for {to}" for to in ("OpenCV", "COLMAP"))
-_BY_NAME = "write its numbers by name, as fx, fy, cx, cy, k1, … beside width, height and model"
+_BY_NAME = "write its numbers, in px, by name, as fx, fy, cx, cy, k1, … beside width, height and model"
 # Other programs, the names that all of their files have, and what to do.
 PROGRAMS = (
     ("PhotonVision", r'"cameraIntrinsics" "distCoeffs"', "write its matrix, coefficients and "
@@ -45,7 +45,7 @@ PROGRAMS = (
      "OpenCV's"),
     ("Gyroflow", '"fisheye_params" "calib_dimension"', "write its matrix, coefficients and size "
      "as OpenCV's"),
-    ("maplab or SVO", r"\bcameras: \bcamera: \bintrinsics:", "write T_B_C beside each camera"),
+    ("maplab or SVO", r"\A(?![\s\S]*\bT_B_C:)[\s\S]*(\bcameras): \bcamera: \bintrinsics:", "write T_B_C beside each camera"),
     ("iKalibr", r"\bpolymorphic_name\b \bptr_wrapper\b \bdisto_param\b", _BY_NAME),
     ("Isaac Sim", r"\bomni:lensdistortion:\w+", _BY_NAME),
     ("COLMAP's rigs", '"image_prefix" "cameras"', "take cameras.txt beside it"),
