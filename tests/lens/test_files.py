@@ -5,6 +5,7 @@ import math
 import re
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -116,9 +117,88 @@ ECHOED = dict(image_size=[480, 640], center=[317.8, 236.4], denominator=[0.548, 
 PINHOLE = dict(model="BrownConrady", radial=FISHEYE[:2], tangential=FISHEYE[2:])
 EIGHT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
+PLACE = dict(zip(("fx", "fy", "cx", "cy"), (421.3, 420.9, 643.1, 478.6), strict=True))
+FOUR, KB4 = [*PLACE.values()], dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True))
+MRCAL = (
+    "# mrcal\n{{ 'lensmodel': 'LENSMODEL_{}',\n 'imagersize': [ 1280, 960,],\n 'intrinsics': {},}}"
+)
+TWELVE = [*PLUMB_BOB, *RATIONAL[5:], 0.01, 0.02, 0.03, 0.04]
+OST = (
+    "# oST version 5.0 parameters\n[image]\nwidth\n1280\nheight\n960\n[narrow_stereo{}]\n"
+    "camera matrix\n421.3 0 643.1\n0 420.9 478.6\n0 0 1\ndistortion\n{} 0.05 0.001 -0.002 0.003\n"
+)
+SENSORS = (
+    "# kapture format: 1.1\nc 0, a b, camera, OPENCV_FISHEYE, 1280, 960, 421.3, 420.9, 643.6, "
+    "479.1, -0.021, 0.0043, -0.0012, 0.00008\nw, , wifi, x\n"
+)
+EQUI = dict(radial=FISHEYE, model="KannalaBrandt", image_size=[960, 1280])
+
+
+def okvis(kind, terms):
+    """A camera of OKVIS."""
+    return json.dumps(dict(cameras=[dict(
+        distortion_type=kind, focal_length=FOUR[:2], principal_point=FOUR[2:], T_SC=[1.0] * 16,
+        image_dimension=[1280, 960], distortion_coefficients=terms)]))  # fmt: skip
+
+
+def ncamera(intrinsics, **distortion):
+    """A camera of maplab."""
+    camera = dict(label="left", type="pinhole" if len(intrinsics) < 5 else "unified-projection",
+                  image_width=1280, image_height=960, intrinsics=dict(rows=4, cols=1,
+                  data=intrinsics), **distortion and dict(distortion=distortion))  # fmt: skip
+    return json.dumps(dict(cameras=[dict(camera=camera, T_B_C=[1.0] * 16)]))
+
+
+def vikit(kind, **terms):
+    """A camera of vikit."""
+    place = {f"cam_{name}": value for name, value in PLACE.items()}
+    return json.dumps(
+        dict(cam_model=kind, cam_width=1280, cam_height=960, scale=0.5) | place | terms
+    )
 
 
 @pytest.mark.parametrize(("text", "options", "expected"), [
+    # Programs whose files name the model.
+    (MRCAL.format("PINHOLE", FOUR), {}, dict(model="Perspective") | SIZE),
+    (MRCAL.format("OPENCV4", [*FOUR, *PLUMB_BOB[:4]]), {}, RADTAN | SIZE),
+    (MRCAL.format("OPENCV5", [*FOUR, *PLUMB_BOB]), {}, PLUMB),
+    (MRCAL.format("OPENCV8", [*FOUR, *RATIONAL]), {}, DIVIDED),
+    (MRCAL.format("OPENCV12", [*FOUR, *TWELVE]), {}, dict(prism=TWELVE[8:])),
+    (okvis("equidistant", FISHEYE), {}, EQUI), (okvis("radialtangential", PLUMB_BOB[:4]), {}, RADTAN),
+    (okvis("radialtangential8", RATIONAL), {}, DIVIDED),
+    (ncamera(FOUR, type="equidistant", parameters=FISHEYE), {}, EQUI),
+    (ncamera(FOUR, type="radial-tangential", parameters=dict(data=PLUMB_BOB[:4])), {}, RADTAN),
+    (ncamera(FOUR, type="fisheye", parameters=[0.9]), {}, dict(model="FieldOfView", omega=0.9)),
+    *((ncamera(FOUR, **none), {}, dict(model="Perspective"))
+      for none in ({}, dict(type="none", parameters=dict(data=[])))),
+    (ncamera([1.1, *FOUR], type="none", parameters=[]), {}, dict(model="Spherical", xi=1.1)),
+    (vikit("EquidistantCamera", **KB4), {}, EQUI),
+    (vikit("Pinhole", cam_d0=-0.22, cam_d1=0.05, cam_d2=0.001, cam_d3=-0.002), {}, RADTAN),
+    *((json.dumps({kind: dict(PLACE, width=1280, height=960, **terms)}), {}, expected)
+      for kind, terms, expected in (
+        ("KannalaBrandt4", KB4, EQUI), ("UCM", dict(alpha=0.6), dict(alpha=0.6, beta=1.0)),
+        ("EUCM", dict(alpha=0.6, beta=1.1), dict(alpha=0.6, beta=1.1)),
+        ("DoubleSphere", dict(xi=-0.1, alpha=0.6), dict(model="DoubleSphere", xi=-0.1)),
+        ("FovCamera", dict(w=0), dict(model="Perspective")),
+        ("OpenCVModel5", dict(k1=-0.22, k2=0.05, p1=0.001, p2=-0.002, k3=0.003), PLUMB))),
+    (SENSORS, {}, EQUI | dict(center=[643.1, 478.6])), (OST.format("", -0.22), {}, PLUMB),
+    *((OST.format("/left", 0) + OST.format("/right", -0.22), dict(camera=camera), PLUMB)
+      for camera in ("right", 1)),
+    ("1 FOV 1280 960 421.3 420.9 643.6 479.1 0\n", {}, dict(model="Perspective")),
+    # A rig with any number of cameras.
+    *((json.dumps({f"{k}{end}": [[300.0 + i, 0, 643], [0, 300, 478], [0, 0, 1]]
+                   for i, end in enumerate(ends)} | {f"dist{end}": FISHEYE for end in ends}
+                  | {f"{side}{end}": n for end in ends for side, n in (("width", 1280), ("height", 960))}
+                  | dict(fisheye=1)),
+       dict(camera=camera), EQUI | dict(focal=focal))
+      for k, ends, camera, focal in (("K", [*range(12)], 11, 311.0),
+                                     ("camera_matrix", ["_0", "_10"], "10", 301.0),
+                                     ("mtx", [".5", "-6"], 6, 301.0))),
+    # A field of view of a camera of Blender.
+    *((json.dumps(dict(w=1280, h=960, camera_angle_x=2 * math.atan(640 / 421.3)) | entries), {},
+       dict(model="Perspective", center=[639.5, 479.5]) | expected) for entries, expected in (
+        ({}, {}), (dict(frames=[{"file_path": "a"}], camera_angle_y=2 * math.atan(480 / 842.6)),
+                   dict(affine=[[1, 0], [0, pytest.approx(2)]])))),
     *((EUROC.format(word), {}, RADTAN | SIZE)
       for word in ("radial-tangential", "radial_tangential", "radtan")),
     (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
@@ -337,3 +417,31 @@ def test_equal_messages_are_one_camera(end, tmp_path):
     messages[2] = messages[2].replace("width: 640", "width: 320")
     path.write_text("---\n".join(messages) + end)
     refused("documents 1 and 3, .* differ in width: keep one", load, path)
+
+
+@pytest.mark.parametrize("end", ["yaml", "json", "xml"])
+def test_a_file_storage_in_base64_and_a_multi_view_result(end, tmp_path):
+    flags, path = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_WRITE_BASE64, str(tmp_path / f"c.{end}")
+    for mode in (cv2.FILE_STORAGE_WRITE, flags):
+        one = dict(
+            fisheye_model=1,
+            camera_matrix=np.array(K),
+            D=np.array([FISHEYE]).T,
+            image_points=np.zeros((9, 90000), np.float32)[:, :: 1 if mode == flags else 900],
+        )
+        rig = dict(
+            Ks=np.stack([K] * 3),
+            distortions=np.array([FISHEYE] * 3),
+            cam_ids="l,m,r",
+            is_fisheye=np.array([0, 0, 1]),
+            image_sizes=np.array([[1280, 960]] * 3),
+        )
+        for entries, camera in ((one, None), (rig, "r")):
+            storage = cv2.FileStorage(path, mode)
+            for name, value in entries.items():
+                storage.write(name, value)
+            storage.release()
+            lens = load(path, camera=camera, dtype=f64, image_size=(960, 1280))
+            described = to_dict(lens)
+            assert described | EQUI == described
+    assert type(load(path, camera="m")).__name__ == "BrownConrady"

@@ -197,6 +197,15 @@ TEXTS = (
         (opencv(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0), "must be 1 × 5 numbers"),
         (opencv(D=D, camera_matrix=[501.0, *K[1:]]), "K and camera_matrix must be the same"),
     )),
+    # The model is named before the count of its numbers; a missing number has no default.
+    (opencv(distortion_model="fov", D=[0.9]), "distortion_model must be one of"),
+    *((json.dumps({kind: dict(fx=300, fy=300, cx=9, cy=9, width=19, height=19, alpha=0.5, **more)}),
+       said) for kind, more, said in (
+        ("Ftheta", {}, "must be one of UCM, EUCM"), ("EUCM", {}, "EUCM.beta is missing"),
+        ("UCM", dict(gamma=1), "a UCM camera does not use the numbers of UCM.gamma"))),
+    (json.dumps(dict(cam_model="ATAN", cam_fx=0.5)), "cam_model must be one of Pinhole"),
+    (json.dumps(dict(camera_angle_x=3.2, w=9, h=9)), "camera_angle_x must be above 0 and below"),
+    ("".join(f"{i} 1 2 3 0 0 0 1\n" for i in range(5)), "a table of 5 lines of 8 words, but must"),
     # More coefficients than the model has, unless they are zeros.
     *((FISHEYES[name]([*FISHEYE, *others]), said) for others in ([1e-9], [0.001, 0])
       for name, said in {
@@ -330,7 +339,7 @@ def frames(count, **shared):
     ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
     ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
     ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
-    ("1 " * 1_000_000, "it is a table of 1 lines of 1000000 words, but must have the lines of calib_results"),
+    ("1 " * 1_000_000, "a table of 1 lines of 1000000 words, but must have the lines of"),
     pytest.param("2 1 1\n" * 400_000, "it must have 5 lines", marks=pytest.mark.slow),
     ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
     ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),

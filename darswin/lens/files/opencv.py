@@ -261,7 +261,9 @@ class Reader:
         elif any(name[0] != "k" for name in found):
             only = "pinhole"
         # The names of coefficients tell the model; their number, as in a list, does not.
-        kind = self.given or self.says() or self.kind(listed(terms), [*terms.values()][:1], xi, only)
+        kind = (
+            self.given or self.says() or self.kind(listed(terms), [*terms.values()][:1], xi, only)
+        )
         model, order, _ = ORDERS[kind]
         # OpenCV calls the denominator's coefficients k4 to k6.
         ours = {"k4": "d1", "k5": "d2", "k6": "d3"} if kind == "pinhole" else {}

@@ -12,7 +12,9 @@ from darswin.utils.nearest import nearest
 _MOST = 20  # entries that are compared
 _LOOKED_AT = 1 << 20  # characters
 _FOR_OPENCV, _FOR_COLMAP = (f"let it write the cameras for {to}" for to in ("OpenCV", "COLMAP"))
-_BY_NAME = "write its numbers, in px, by name, as fx, fy, cx, cy, k1, … beside width, height and model"
+_BY_NAME = (
+    "write its numbers, in px, by name, as fx, fy, cx, cy, k1, … beside width, height and model"
+)
 # Other programs, the names that all of their files have, and what to do.
 PROGRAMS = (
     ("PhotonVision", r'"cameraIntrinsics" "distCoeffs"', "write its matrix, coefficients and "
