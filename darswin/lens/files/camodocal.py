@@ -12,7 +12,7 @@ from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
-from darswin.lens.files.named import PLANE, RADTAN, Named
+from darswin.lens.files.named import PLANE, RADTAN, Named, flat
 from darswin.lens.image import Size
 from darswin.lens.polynomial import OCam, OCamInverse
 
@@ -37,28 +37,25 @@ class CamOdoCal(Named):
         )
 
     def _found(self, content: Mapping) -> list[tuple[str, Fields]]:
-        file = Fields(content)
+        file = Fields(flat(content))
         return [(file.text("camera_name") if "camera_name" in file else "camera", file)]
 
     def _described(self, camera: Fields, kind: str, size: Size) -> Description:
         described = _scaramuzza if kind == "SCARAMUZZA" else super()._described
-        description = described(camera, kind, size)
-        # Mappings with `data` are matrices of the camera's pose, which is not used.
-        camera.check_all_read(kind, lambda _, value: _is_section(value))
-        return description
+        return described(camera, kind, size)
 
 
-_DISTORTION = {"distortion_parameters": RADTAN}
+_DISTORTION = {"distortion_parameters.": RADTAN}
 CAMODOCAL = CamOdoCal(
     "KITTI-360 or CamOdoCal", "model_type and projection_parameters", (),
     ("model_type", *SECTIONS), ("model_type",), {
-        "MEI": (Mei, {"projection_parameters": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
-                      "mirror_parameters": "xi"} | _DISTORTION),
+        "MEI": (Mei, {"projection_parameters.": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
+                      "mirror_parameters.": "xi"} | _DISTORTION),
         "KANNALA_BRANDT": (KannalaBrandt, {
-            "projection_parameters": "fx=mu fy=mv cx=u0 cy=v0 k1=k2 k2=k3 k3=k4 k4=k5"}),
-        "PINHOLE": (BrownConrady, {"projection_parameters": PLANE} | _DISTORTION),
+            "projection_parameters.": "fx=mu fy=mv cx=u0 cy=v0 k1=k2 k2=k3 k3=k4 k4=k5"}),
+        "PINHOLE": (BrownConrady, {"projection_parameters.": PLANE} | _DISTORTION),
         "SCARAMUZZA": (OCam, {})},
-    "image_width image_height",
+    "image_width image_height", strict=r".*\..*",
 )  # fmt: skip
 
 
@@ -87,28 +84,24 @@ def _is_section(value: Any) -> bool:
 
 def _scaramuzza(file: Fields, kind: str, size: Any) -> Description:
     """OCamCalib's polynomials. The sign of a₀ tells which way the optical axis points."""
-    section = file.section("affine_parameters")
-    affine = section.values("cx cy c=ac d=ad e=ae")
-    section.check_all_read(kind)
+    affine = file.values("cx cy c=ac d=ad e=ae", prefix="affine_parameters.")
     matrix = [[affine["c"], affine["d"]], [affine["e"], 1.0]]
-    direct = _polynomial(file.section("poly_parameters"))
+    direct = _polynomial(file, "poly_parameters.")
     inverse = []
-    if "inv_poly_parameters" in file:
-        inverse = _polynomial(file.section("inv_poly_parameters"))
+    if any(name.startswith("inv_poly_parameters.") for name in file.entries):
+        inverse = _polynomial(file, "inv_poly_parameters.")
     if direct[0] > 0:
         direct = [-c for c in direct]
         inverse = [c * (-1) ** i for i, c in enumerate(inverse)]
     return _ocam(direct, inverse, (affine["cx"], affine["cy"]), matrix, size)
 
 
-def _polynomial(fields: Fields) -> list[float]:
+def _polynomial(file: Fields, prefix: str) -> list[float]:
     """p0, p1, … up to the first that is missing."""
     count = 1
-    while count < MAX_COEFFICIENTS and f"p{count}" in fields:
+    while count < MAX_COEFFICIENTS and f"{prefix}p{count}" in file:
         count += 1
-    coefficients = fields.values(" ".join(f"p{i}" for i in range(count)))
-    fields.check_all_read("SCARAMUZZA")
-    return list(coefficients.values())
+    return [*file.values(" ".join(f"p{i}" for i in range(count)), prefix=prefix).values()]
 
 
 def _camera_of_rows(rows: list[list[str]]) -> Description:

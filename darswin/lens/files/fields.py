@@ -114,7 +114,6 @@ class Fields:
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
         self.entries, self._where = entries, where
         self._read: set[str] = set()
-        self._sections: dict[str, Fields] = {}
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries
@@ -149,9 +148,7 @@ class Fields:
         return value
 
     def section(self, name: str) -> "Fields":
-        """The mapping `name`, which remembers too what was read of it."""
-        entries = self.of_kind(name, Mapping, "a mapping")
-        return self._sections.setdefault(name, Fields(entries, f"{self.path(name)}."))
+        return Fields(self.of_kind(name, Mapping, "a mapping"), f"{self.path(name)}.")
 
     def sections(self, name: str) -> "list[Fields]":
         expected = "a list of mappings"
@@ -170,13 +167,15 @@ class Fields:
         expected = "a finite number above 0"
         return to_number(self.get(name, expected), self.path(name), expected, lambda n: n > 0)
 
-    def values(self, names: str, default: float | None = None) -> dict[str, float]:
+    def values(
+        self, names: str, default: float | None = None, prefix: str = ""
+    ) -> dict[str, float]:
         """Several numbers by our names, such as "fx fy k1". "fx=gamma1" reads `fx` from the file's
-        entry `gamma1`. Focal lengths must be above 0."""
+        entry `gamma1`, after a prefix. Focal lengths must be above 0."""
         found = {}
         for word in names.split():
             ours, _, theirs = word.partition("=")
-            name = theirs or ours
+            name = prefix + (theirs or ours)
             is_focal = ours in ("fx", "fy")
             found[ours] = self.positive(name) if is_focal else self.number(name, default)
         return found

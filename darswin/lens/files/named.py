@@ -4,9 +4,11 @@ Each format is a row: where its cameras are, which words name a model, and where
 Kalibr's camchain YAML is written too.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import yaml
@@ -14,7 +16,7 @@ import yaml
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, holds_numbers, like_coefficients, short
+from darswin.lens.files.fields import Fields, like_coefficients, short
 from darswin.lens.files.format import (
     Cameras,
     Description,
@@ -28,18 +30,19 @@ from darswin.lens.image import Size
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 from darswin.utils.text import mapping
 
-# For the words that name a model: our class, and the numbers of each entry. Those of a mapping have
-# these names, those of a list this order. The entry "" is the camera itself.
+# For the words that name a model: our class, and the numbers of each entry. A list has this order;
+# in a mapping, such as "a.", or in the camera, "", the numbers have these names.
 Kinds = dict[str, tuple[type[Lens], dict[str, str]]]
 PLANE, RADTAN = "fx fy cx cy", "k1 k2 p1 p2"
 RADTANS = ("radtan", "radial-tangential")  # Kalibr's word and others'
 EIGHT = f"{RADTAN} k3 d1 d2 d3"
 KEY = "the model"  # the name of a camera's entry in the mapping around it
+MAX_DEPTH, MAX_ENTRIES = 3, 10_000  # of mappings in a camera, and of its entries
 
 
 @dataclass(eq=False)
 class Named(Format):
-    """A format whose cameras are mappings. An entry inside a mapping has a path, such as a/b.
+    """A format whose cameras are mappings. An entry inside a mapping is called a.b.
 
     Attributes:
         where: the paths of cameras, of which the first one that a file has counts. * is any name.
@@ -49,7 +52,7 @@ class Named(Format):
             camera's own name.
         size: the entry with the width and the height, which may be missing; or an entry for each.
         label: the entry with the camera's name, if it has one.
-        others: entries whose numbers are not used.
+        strict: a pattern of the entries whose numbers must all be used; else coefficients must.
     """
 
     name: str
@@ -60,7 +63,7 @@ class Named(Format):
     kinds: Kinds
     size: str
     label: str = KEY
-    others: tuple[str, ...] = ()
+    strict: str = "-"
 
     def recognizes(self, content: Content) -> bool:
         return isinstance(content, Mapping) and bool(self._found(content))
@@ -74,79 +77,64 @@ class Named(Format):
         not find another camera."""
         for where in self.where:
             found = [
-                (path, {KEY: key, **entry}) for path, key, entry in _places(content, where)
+                (path, {KEY: key, **entry})
+                for path, key, entry in islice(_places(content, where), MAX_ENTRIES)
                 if isinstance(entry, Mapping) and not {*self.marks[:2]}.isdisjoint({KEY, *entry})
             ]  # fmt: skip
             if any(self.marks[0] in e and has_several(e, self.marks) for _, e in found):
-                names = ([*_places(e, self.label), *_places(e, KEY)][0][-1] for _, e in found)
-                fields = (Fields(entry, path and f"{path}.") for path, entry in found)
-                return [*zip(map(str, names), fields, strict=True)]
+                cameras = ((path and f"{path}.", flat(entry)) for path, entry in found)
+                return [(str(e.get(self.label, e[KEY])), Fields(e, path)) for path, e in cameras]
         return []
 
     def _camera(self, camera: Fields) -> Description:
         words: list[str] = []
-        for path in self.words:
+        for name in self.words:
             kinds = [kind.split() for kind in self.kinds]
             allowed = dict.fromkeys(k[len(words)] for k in kinds if k[: len(words)] == words)
-            if "/" in path and "none" in allowed and not [*_places(camera.entries, path)]:
-                words.append("none")  # maplab leaves the distortion out
-            else:
-                holder, name = _holder(camera, path)
-                words.append(holder.one_of(name, allowed))
-        return self._described(camera, " ".join(words), self._size(camera))
-
-    def _size(self, camera: Fields) -> Size:
-        across, *down = (_holder(camera, path) for path in self.size.split())
+            is_none = "." in name and name not in camera and "none" in allowed  # of maplab
+            words.append("none" if is_none else camera.one_of(name, allowed))
+        across, *down = self.size.split()
+        size: Size = None
         if down:
-            return down[0][0].side(down[0][1]), across[0].side(across[1])
-        return across[0].sides(across[1])[::-1] if across[1] in across[0] else None
+            size = camera.side(down[0]), camera.side(across)
+        elif across in camera:
+            size = camera.sides(across)[::-1]
+        description = self._described(camera, " ".join(words), size)
+        camera.check_all_read(
+            f"a {' '.join(words)} camera",
+            lambda name, value: (
+                bool(re.fullmatch(self.strict, name))
+                or like_coefficients(name.rpartition(".")[2], value)
+            ),
+        )
+        return description
 
     def _described(self, camera: Fields, kind: str, size: Size) -> Description:
         model, entries = self.kinds[kind]
-        what, values = f"a {kind} camera", dict[str, float]()
-        holders = [camera]
-        for path, names in entries.items():
-            if path and not names:  # without distortion
-                there = [v["data"] if isinstance(v, Mapping) and "data" in v else v
-                         for *_, v in _places(camera.entries, path)]  # fmt: skip
-                if any(map(holds_numbers, there)):
-                    text = f"{what} does not use the numbers of {path.replace('/', '.')}"
-                    raise ValueError(text)
-                continue
-            holder, name = _holder(camera, path)
-            value = holder.entries.get(name)
-            if isinstance(value, Mapping) and "data" in value:  # a matrix
-                holder, name = holder.section(name), "data"
-            if not name:
-                values |= holder.values(names)
-                holder.check_all_read(what, lambda name, _: KEY in self.words)
-            elif isinstance(value, Mapping) and name != "data":
-                section = holder.section(name)
-                values |= section.values(names)
-                section.check_all_read(what, lambda name, _: name not in self.others)
-            else:
-                values |= _in_order(holder, name, names, model)
-            holders.append(holder)
-        for holder in holders:
-            holder.check_all_read(what, like_coefficients)
+        values: dict[str, float] = {}
+        for name, names in entries.items():
+            by_name = not name or name.endswith(".")
+            values |= camera.values(names, prefix=name) if by_name else _listed(camera, name, names)
         return describe(model, values, size)
 
 
-def _in_order(fields: Fields, name: str, names: str, model: type[Lens]) -> dict[str, float]:
-    """The numbers of a list. Programs fill up the coefficients of a fisheye with zeros."""
-    words = names.split()
-    least = len(words) if model is KannalaBrandt else None
-    values = dict(zip(words, fields.numbers(name, (len(words),), least), strict=True))
-    for i, word in enumerate(words):
+def _listed(camera: Fields, names: str, words: str) -> dict[str, float]:
+    """The numbers of a list, whose name may be any of several with | between. Programs fill up the
+    coefficients of a fisheye with zeros."""
+    name = next((name for name in names.split("|") if name in camera), names.split("|")[0])
+    ours = words.split()
+    least = len(ours) if "k4" in ours else None
+    values = dict(zip(ours, camera.numbers(name, (len(ours),), least), strict=True))
+    for i, word in enumerate(ours):
         if word in ("fx", "fy") and not values[word] > 0:
-            where = fields.path(f"{name}[{i}]")
+            where = camera.path(f"{name}[{i}]")
             raise ValueError(f"{where} must be a focal length above 0, got {values[word]:g}")
     return values
 
 
 def _places(value: Any, where: str, path: str = "", key: str = "camera") -> Iterator[tuple]:
     """The path, the name and the value of each entry whose path `where` is."""
-    name, _, rest = where.partition("/")
+    name, _, rest = where.partition(".")
     if not where:
         yield path, key, value
     elif isinstance(value, Mapping):
@@ -157,22 +145,28 @@ def _places(value: Any, where: str, path: str = "", key: str = "camera") -> Iter
             yield from _places(entry, rest, f"{path}[{i}]", f"cam{i}")
 
 
-def _holder(camera: Fields, path: str) -> tuple[Fields, str]:
-    """The mapping with the last entry of a path, whose name may be any of several with | between,
-    and that name."""
-    *sections, names = path.split("/")
-    for section in sections:
-        camera = camera.section(section)
-    return camera, next((name for name in names.split("|") if name in camera), names.split("|")[0])
+def flat(entry: Mapping, prefix: str = "", depth: int = MAX_DEPTH) -> dict[str, Any]:
+    """The entries of a mapping and of those inside it. A matrix is its `data`."""
+    found: dict[str, Any] = {}
+    for key, value in entry.items():
+        if len(found) > MAX_ENTRIES:
+            raise ValueError(f"a camera must have at most {MAX_ENTRIES} entries")
+        if isinstance(value, Mapping) and depth > 0 and "data" not in value:
+            found |= flat(value, f"{prefix}{key}.", depth - 1)
+        else:
+            found[f"{prefix}{key}"] = value.get("data") if isinstance(value, Mapping) else value
+    return found
 
 
 def _pinholes(plane: str, terms: str, fov: str) -> Kinds:
     """Pinholes by the words for their distortion, with the coefficients in their own entry."""
     return {
-        **dict.fromkeys(RADTANS, (BrownConrady, {plane: PLANE, terms: RADTAN})),
-        "equidistant": (KannalaBrandt, {plane: PLANE, terms: "k1 k2 k3 k4"}),
-        fov: (FieldOfView, {plane: PLANE, terms: "omega"}),
-        "none": (BrownConrady, {plane: PLANE, terms: ""}),
+        **dict.fromkeys(
+            (f"pinhole {word}" for word in RADTANS), (BrownConrady, {plane: PLANE, terms: RADTAN})
+        ),
+        "pinhole equidistant": (KannalaBrandt, {plane: PLANE, terms: "k1 k2 k3 k4"}),
+        f"pinhole {fov}": (FieldOfView, {plane: PLANE, terms: "omega"}),
+        "pinhole none": (BrownConrady, {plane: PLANE}),
     }
 
 
@@ -225,7 +219,10 @@ class Basalt(Named):
                 raise ValueError(f"{where} must be {expected}, got {short(pairs)}")
             for entry, pair in zip(entries, pairs, strict=True):
                 entry.entries = {**entry.entries, self.size: pair}
-        return [(f"cam{i}", entry) for i, entry in enumerate(entries)]
+        cameras = [
+            Fields(flat(e.entries), f"value0.intrinsics[{i}].") for i, e in enumerate(entries)
+        ]
+        return [(f"cam{i}", entry) for i, entry in enumerate(cameras)]
 
 
 _TERMS = "distortion_coeffs|distortion_coefficients"  # Kalibr's and EuRoC's
@@ -233,7 +230,7 @@ KALIBR = Kalibr(
     "Kalibr", "cam0 with camera_model, intrinsics and distortion_coeffs", ("", "*"),
     ("camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution"),
     ("camera_model", "distortion_model"),
-    {f"pinhole {word}": kind for word, kind in _pinholes("intrinsics", _TERMS, "fov").items()} | {
+    _pinholes("intrinsics", _TERMS, "fov") | {
         "omni radtan": (Mei, {"intrinsics": f"xi {PLANE}", _TERMS: RADTAN}),
         "omni none": (Mei, {"intrinsics": f"xi {PLANE}"}),
         "ds none": (DoubleSphere, {"intrinsics": f"xi alpha {PLANE}"}),
@@ -242,15 +239,15 @@ KALIBR = Kalibr(
 )  # fmt: skip
 BASALT = Basalt(
     "basalt", "value0 with intrinsics and resolution", (), (), ("camera_type",), {
-        "ds": (DoubleSphere, {"intrinsics": f"{PLANE} xi alpha"}),
-        "eucm": (EnhancedUnified, {"intrinsics": f"{PLANE} alpha beta"}),
-        "ucm": (EnhancedUnified, {"intrinsics": f"{PLANE} alpha"}),
-        "kb4": (KannalaBrandt, {"intrinsics": f"{PLANE} k1 k2 k3 k4"}),
-        "fov": (FieldOfView, {"intrinsics": f"{PLANE} omega=w"}),
-        "pinhole": (BrownConrady, {"intrinsics": PLANE}),
+        "ds": (DoubleSphere, {"intrinsics.": f"{PLANE} xi alpha"}),
+        "eucm": (EnhancedUnified, {"intrinsics.": f"{PLANE} alpha beta"}),
+        "ucm": (EnhancedUnified, {"intrinsics.": f"{PLANE} alpha"}),
+        "kb4": (KannalaBrandt, {"intrinsics.": f"{PLANE} k1 k2 k3 k4"}),
+        "fov": (FieldOfView, {"intrinsics.": f"{PLANE} omega=w"}),
+        "pinhole": (BrownConrady, {"intrinsics.": PLANE}),
         "pinhole-radtan8": (
-            BrownConrady, {"intrinsics": f"{PLANE} {RADTAN} k3 d1=k4 d2=k5 d3=k6"})},
-    "resolution", others=("rpmax",),
+            BrownConrady, {"intrinsics.": f"{PLANE} {RADTAN} k3 d1=k4 d2=k5 d3=k6"})},
+    "resolution", strict=r"intrinsics\.(?!rpmax).*",
 )  # fmt: skip
 # The numbers of other programs are in the terms of their own sources.
 NEIGHBOURS = (
@@ -263,7 +260,7 @@ NEIGHBOURS = (
         "imagersize",
     ),
     Named(
-        "OKVIS", "cameras with distortion_type, focal_length and principal_point", ("cameras/*",),
+        "OKVIS", "cameras with distortion_type, focal_length and principal_point", ("cameras.*",),
         ("distortion_type", "focal_length", "principal_point", "image_dimension"),
         ("distortion_type",), {
             word: (model, {"focal_length": "fx fy", "principal_point": "cx cy",
@@ -274,17 +271,16 @@ NEIGHBOURS = (
         "image_dimension",
     ),
     Named(
-        "maplab or SVO", "cameras, each with camera and T_B_C", ("cameras/*", "sensors/*/cameras/*"),
-        ("camera", "T_B_C"), ("camera/type", "camera/distortion/type"),
-        {f"pinhole {word}": kind for word, kind in _pinholes(
-            "camera/intrinsics", "camera/distortion/parameters", "fisheye").items()} | {
-            "unified-projection radial-tangential": (Mei, {"camera/intrinsics": f"xi {PLANE}",
-                                                "camera/distortion/parameters": RADTAN}),
-            "unified-projection none": (Mei, {"camera/intrinsics": f"xi {PLANE}"})},
-        "camera/image_width camera/image_height", "camera/label",
+        "maplab or SVO", "cameras, each with camera and T_B_C", ("cameras.*", "sensors.*.cameras.*"),
+        ("camera", "T_B_C"), ("camera.type", "camera.distortion.type"),
+        _pinholes("camera.intrinsics", "camera.distortion.parameters", "fisheye") | {
+            "unified-projection radial-tangential": (Mei, {"camera.intrinsics": f"xi {PLANE}",
+                                                "camera.distortion.parameters": RADTAN}),
+            "unified-projection none": (Mei, {"camera.intrinsics": f"xi {PLANE}"})},
+        "camera.image_width camera.image_height", "camera.label", r"camera\.distortion\..*",
     ),
     Named(
-        "vikit", "cam_model, cam_fx, cam_fy, cam_cx, …", ("", "*", "*/ros__parameters", "*/*/*"),
+        "vikit", "cam_model, cam_fx, cam_fy, cam_cx, …", ("", "*", "*.ros__parameters", "*.*.*"),
         ("cam_model", "cam_fx", "cam_width"), ("cam_model",), {
             word: (model, {"": f"fx=cam_fx fy=cam_fy cx=cam_cx cy=cam_cy {terms}"})
             for word, model, terms in (
@@ -302,6 +298,6 @@ NEIGHBOURS = (
                 ("DoubleSphere", DoubleSphere, "xi alpha"), ("FovCamera", FieldOfView, "omega=w"),
                 ("KannalaBrandt4", KannalaBrandt, "k1 k2 k3 k4"),
                 ("OpenCVModel5", BrownConrady, f"{RADTAN} k3"))},
-        "width height",
+        "width height", strict=".*",
     ),
 )  # fmt: skip
