@@ -11,7 +11,7 @@ from darswin.cli.undistort import undistort
 from darswin.cli.views import Look, Up
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration
-from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.reader import Coefficients
 from darswin.lens.files.save import closest
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing

@@ -16,7 +16,7 @@ from darswin.cli.pictures import Broken, File, check_paths, claim_folder, file_n
 from darswin.compat import load_official
 from darswin.data.cameras import Calibrations
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
-from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.reader import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import replace_file

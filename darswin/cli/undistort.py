@@ -13,7 +13,7 @@ import darswin.lens
 from darswin.cli.views import Look, Up
 from darswin.lens import Lens
 from darswin.lens.files.load import reach
-from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
 

@@ -26,7 +26,7 @@ from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_ins
 from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.load import Calibration
-from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.image import (
     BrokenImageError,

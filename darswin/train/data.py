@@ -22,7 +22,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Sample
 from darswin.data.splits import Split
 from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
-from darswin.lens.files.opencv import Coefficients
+from darswin.lens.files.reader import Coefficients
 from darswin.train.runs import ignore_signals
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit

@@ -16,7 +16,6 @@ from darswin.lens.files.camodocal import CAMODOCAL, OCamCalib
 from darswin.lens.files.content import Content, decoded, parse, read_bytes
 from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
-from darswin.lens.files.multiview import MultiView
 from darswin.lens.files.named import BASALT, KALIBR, NEIGHBOURS
 from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
@@ -32,7 +31,7 @@ MAX_CAMERAS = 10_000
 
 # The first one that fits a file reads it.
 FORMATS: tuple[Format, ...] = (
-    Own(), WoodScape(), BASALT, Nerfstudio(), CAMODOCAL, KALIBR, *NEIGHBOURS, MultiView(),
+    Own(), WoodScape(), BASALT, Nerfstudio(), CAMODOCAL, KALIBR, *NEIGHBOURS, opencv.MultiView(),
     opencv.ByName(), opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
 _UNKNOWN = "unknown format: {}. The formats are " + ", ".join(format.name for format in FORMATS)

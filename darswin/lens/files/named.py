@@ -1,4 +1,4 @@
-"""Cameras whose entries name the model: of Kalibr, EuRoC, basalt, mrcal, OKVIS, maplab, vikit, ccrs.
+"""Cameras whose entries name the model: Kalibr, EuRoC, basalt, mrcal, OKVIS, maplab, vikit, ccrs.
 
 Each format is a row: where its cameras are, which words name a model, and where its numbers are.
 Kalibr's camchain YAML is written too.
@@ -271,7 +271,8 @@ NEIGHBOURS = (
         "image_dimension",
     ),
     Named(
-        "maplab or SVO", "cameras, each with camera and T_B_C", ("cameras.*", "sensors.*.cameras.*"),
+        "maplab or SVO", "cameras, each with its camera and T_B_C",
+        ("cameras.*", "sensors.*.cameras.*"),
         ("camera", "T_B_C"), ("camera.type", "camera.distortion.type"),
         _pinholes("camera.intrinsics", "camera.distortion.parameters", "fisheye") | {
             "unified-projection radial-tangential": (Mei, {"camera.intrinsics": f"xi {PLANE}",

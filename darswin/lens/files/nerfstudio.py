@@ -18,7 +18,7 @@ from darswin.lens.files.fields import (
     to_number,
 )
 from darswin.lens.files.format import Cameras, Description, Format, describe, has_several
-from darswin.lens.files.opencv import SAYS_FISHEYE
+from darswin.lens.files.reader import SAYS_FISHEYE
 
 MODELS = {
     "SIMPLE_PINHOLE": BrownConrady, "PINHOLE": BrownConrady, "SIMPLE_RADIAL": BrownConrady,

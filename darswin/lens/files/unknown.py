@@ -47,7 +47,8 @@ PROGRAMS = (
      "OpenCV's"),
     ("Gyroflow", '"fisheye_params" "calib_dimension"', "write its matrix, coefficients and size "
      "as OpenCV's"),
-    ("maplab or SVO", r"\A(?![\s\S]*\bT_B_C:)[\s\S]*(\bcameras): \bcamera: \bintrinsics:", "write T_B_C beside each camera"),
+    ("maplab or SVO", r"\A(?![\s\S]*\bT_B_C:)[\s\S]*(\bcameras): \bcamera: \bintrinsics:",
+     "write T_B_C beside each camera"),
     ("iKalibr", r"\bpolymorphic_name\b \bptr_wrapper\b \bdisto_param\b", _BY_NAME),
     ("Isaac Sim", r"\bomni:lensdistortion:\w+", _BY_NAME),
     ("COLMAP's rigs", '"image_prefix" "cameras"', "take cameras.txt beside it"),
