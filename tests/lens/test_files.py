@@ -164,7 +164,8 @@ def vikit(kind, **terms):
     (MRCAL.format("OPENCV5", [*FOUR, *PLUMB_BOB]), {}, PLUMB),
     (MRCAL.format("OPENCV8", [*FOUR, *RATIONAL]), {}, DIVIDED),
     (MRCAL.format("OPENCV12", [*FOUR, *TWELVE]), {}, dict(prism=TWELVE[8:])),
-    (okvis("equidistant", FISHEYE), {}, EQUI), (okvis("radialtangential", PLUMB_BOB[:4]), {}, RADTAN),
+    (okvis("equidistant", FISHEYE), {}, EQUI),
+    (okvis("radialtangential", PLUMB_BOB[:4]), {}, RADTAN),
     (okvis("radialtangential8", RATIONAL), {}, DIVIDED),
     (ncamera(FOUR, type="equidistant", parameters=FISHEYE), {}, EQUI),
     (ncamera(FOUR, type="radial-tangential", parameters=dict(data=PLUMB_BOB[:4])), {}, RADTAN),
@@ -188,8 +189,7 @@ def vikit(kind, **terms):
     # A rig with any number of cameras.
     *((json.dumps({f"{k}{end}": [[300.0 + i, 0, 643], [0, 300, 478], [0, 0, 1]]
                    for i, end in enumerate(ends)} | {f"dist{end}": FISHEYE for end in ends}
-                  | {f"{side}{end}": n for end in ends for side, n in (("width", 1280), ("height", 960))}
-                  | dict(fisheye=1)),
+                  | {f"shape{end}": [960, 1280] for end in ends} | dict(fisheye=1)),
        dict(camera=camera), EQUI | dict(focal=focal))
       for k, ends, camera, focal in (("K", [*range(12)], 11, 311.0),
                                      ("camera_matrix", ["_0", "_10"], "10", 301.0),

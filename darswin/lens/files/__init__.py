@@ -1,1 +1,1 @@
-"""Calibration files: ten formats are read, four are written."""
+"""Calibration files: seventeen formats are read, four are written."""

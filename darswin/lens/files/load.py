@@ -50,7 +50,8 @@ def load(
 
     The formats are WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and
     pinhole; also its arrays in an .npz file, or fx, fy, cx, cy, k1, … by name), ROS camera_info,
-    OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, instant-ngp, basalt, and our own JSON.
+    OCamCalib, COLMAP, kapture, nerfstudio, instant-ngp, basalt, mrcal, OKVIS, maplab, SVO, vikit,
+    ccrs, and our own JSON.
     The content of the file tells the format; its name does not matter.
 
     Args:
