@@ -8,18 +8,20 @@ k1, k2, p1, … beside them.
 import re
 from collections.abc import Mapping
 from functools import partial
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, plain_name
+from darswin.lens.files.fields import Fields, plain_name, short
 from darswin.lens.files.format import Cameras, Format, Intrinsics, has_several
 from darswin.lens.files.reader import BESIDE, MATRIX, MODELS, ORDERS, PLANE, Reader, matrices
 from darswin.utils.text import mapping
 
 # Entries of OpenCV 5's multi-view calibration, each with the values of all cameras.
 VIEWS = ("Ks", "distortions", "is_fisheye", "image_sizes")
+MAX_NUMBERS = 10_000  # in one of them
 
 
 class OpenCV(Format):
@@ -130,7 +132,7 @@ class MultiView(OpenCV):
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         numbers = {key: _flat(file.get(key, "the numbers of all cameras")) for key in VIEWS}
-        count, entries = len(numbers["is_fisheye"]), dict[str, Any]()
+        count, entries = max(len(numbers["is_fisheye"]), 1), dict[str, Any]()
         for key, values in numbers.items():
             if not values or len(values) % count:
                 each = f"as many numbers for each of the {count} cameras of is_fisheye"
@@ -142,26 +144,26 @@ class MultiView(OpenCV):
             )
             entries |= {f"K_{i}": matrix, f"distortion_{i}": terms, f"is_fisheye_{i}": flag[0],
                         f"image_width_{i}": size[:1], f"image_height_{i}": size[1:]}  # fmt: skip
-        ids = next((file.entries[key] for key in ("cam_ids", "cam_names") if key in file), None)
+        keys = [key for key in ("cam_ids", "cam_names") if key in file]
+        ids = file.entries[keys[0]] if keys else [*range(count)]
         names = ids.split(",") if isinstance(ids, str) else ids
-        if names is None:
-            names = [*range(count)]
         if not isinstance(names, list) or len(names) != count:
-            raise ValueError(f"cam_ids must be the names of {count} cameras, got {ids!r}")
+            raise ValueError(f"cam_ids must be the names of {count} cameras, got {short(ids)}")
         reader = Reader(Fields(entries), coefficients)
         cameras = (partial(reader.camera, str(i)) for i in range(count))
         return mapping(zip((str(name).strip() for name in names), cameras, strict=True))
 
 
 def _flat(value: Any) -> list:
-    """The numbers of a matrix, or of nested lists."""
+    """The numbers of a matrix, or of lists of lists of lists."""
     if isinstance(value, Mapping):
         value = value.get("data")
-    if isinstance(value, str):
-        value = value.split()
     if not isinstance(value, list):
-        return [value]
-    return [entry for row in value for entry in (_flat(row) if isinstance(row, list) else [row])]
+        return value.split() if isinstance(value, str) else [value]
+    for _ in range(2):
+        rows = (row if isinstance(row, list) else [row] for row in value)
+        value = [*islice(chain.from_iterable(rows), MAX_NUMBERS)]
+    return value
 
 
 def _is_matrix(value: Any) -> bool:
