@@ -327,7 +327,7 @@ def frames(count, **shared):
     (BOMB, "The formats are"),
     (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
      "image_height must be a whole number"),
-    (BOMB + "Ks: *j\nis_fisheye: []\ndistortions: *j\nimage_sizes: *j", "must have as many numbers"),
+    (BOMB + "Ks: *j\nis_fisheye: []\ndistortions: *j\nimage_sizes: *j", "must have as many"),
     (BOMB + "K: *j\n", "K must be 9 finite numbers"),
     (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
     ("a: &a [*a]\n", "it is not valid YAML"),
