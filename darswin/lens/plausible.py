@@ -6,6 +6,8 @@ from collections.abc import Mapping
 import torch
 
 from darswin.lens.base import Lens
+from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
+from darswin.lens.polynomial import PolynomialLens
 
 # The thresholds lie far from real lenses. Their image circles are as large as the picture's shorter
 # side or larger, and half the diagonal spans 0.4 to 4 rad in pixels of the axis. Small circles in
@@ -14,6 +16,8 @@ SMALLEST_CIRCLE = 0.2  # of the shorter side
 LARGEST_RADIUS = 20.0  # halves of the diagonal
 SMALLEST_SPAN, LARGEST_SPAN = 1e-4, 40.0  # rad
 WIDEST_PINHOLE = math.radians(86)
+MOST_CHANGE = 8.0  # times, of the px per angle, beside those of a pinhole
+MOST_MISSED = 3.0  # px; calibrations miss their corners by less than 1 px
 # The distance of the principal point from the middle, in parts of the picture. A crop along one
 # side and a shifted lens move it along one axis; another unit moves it along both.
 FAR_ON_BOTH, FAR_ON_ONE, NEAR = 0.2, 1.0, 0.1
@@ -32,11 +36,12 @@ class ImplausibleLens(UserWarning):
     """A warning of a calibration that does not fit its picture, as if in another unit."""
 
 
-def doubts(lens: Lens) -> list[str]:
+def doubts(lens: Lens, missed: float = 0.0) -> list[str]:
     """What looks wrong with each lens in its picture, and what would fit; "" if nothing does.
 
     The image circle up to θ_max, the pixels per angle, θ_max and the principal point are held
-    against the picture. A lens without an image_size is not doubted.
+    against the picture, and so are the px by which the calibration missed its corners, as far as
+    its file says. A lens without an image_size is not doubted.
     """
     if lens.image_size is None:
         return [""] * len(lens)
@@ -45,15 +50,27 @@ def doubts(lens: Lens) -> list[str]:
     limit, small = lens.theta_limit, lens.theta_limit.clamp(max=0.1)
     scale = lens.project(small) / small
     is_pinhole = (limit < math.pi / 2) & (lens.project(limit) > 10 * scale)
-    rows = (lens.theta_max, stretch * lens.r_max, stretch * scale, is_pinhole,
+    rows = (lens.theta_max, stretch * lens.r_max, stretch * scale, is_pinhole, _change(lens),
             lens.center_in().flatten(1), lens.image_size)  # fmt: skip
     values = [row.expand(len(lens), *row.shape[1:]).tolist() for row in rows]
-    return [_doubt(*of_one) for of_one in zip(*values, strict=True)]
+    return [_doubt(missed, *of_one) for of_one in zip(*values, strict=True)]
+
+
+def _change(lens: Lens) -> torch.Tensor:
+    """(N,): how many-fold the px per angle change within the picture, for models whose terms a
+    failed calibration can make wild; of a pinhole, beside those of one without terms."""
+    if not isinstance(lens, (BrownConrady, Fisheye624, KannalaBrandt, PolynomialLens)):
+        return torch.ones(1)
+    theta = lens.theta_max[:, None] * torch.linspace(0, 0.9, 33).to(lens.theta_max)
+    steps = lens.project(theta).diff(dim=1) / theta.diff(dim=1)
+    part = steps / steps[:, :1]
+    most = part * theta[:, 1:].cos().square() if isinstance(lens, BrownConrady) else part
+    return torch.maximum(most.amax(1), 1 / part.amin(1))
 
 
 def _doubt(
-    theta_max: float, radius: float, scale: float, is_pinhole: bool, center: list[float],
-    size: list[float],
+    missed: float, theta_max: float, radius: float, scale: float, is_pinhole: bool, change: float,
+    center: list[float], size: list[float],
 ) -> str:  # fmt: skip
     """That of one lens; radius: of the image circle, px; scale: px per rad at the axis."""
     (height, width), (x, y) = size, center
@@ -73,10 +90,13 @@ def _doubt(
     )  # fmt: skip
     if far or max(off) > FAR_ON_ONE or swapped:
         oddities.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
-    if not oddities:
-        return ""
-    guess = _guess(x, y, width, height, min(max(scale, 1e-99), 1e99))
-    return f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(oddities)}{guess}"
+    guess = _guess(x, y, width, height, min(max(scale, 1e-99), 1e99)) if oddities else ""
+    if change > MOST_CHANGE:
+        oddities.insert(0, f"px per degree that change {change:.2g}-fold, as after a failed fit")
+    if missed > MOST_MISSED:
+        oddities.insert(0, f"corners that its calibration missed by {missed:.3g} px")
+    shown = f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(oddities)}{guess}"
+    return shown if oddities else ""
 
 
 def off_middle(x: float, y: float, width: float, height: float) -> float:

@@ -9,6 +9,8 @@ from darswin.lens.base import MARGIN, Lens
 from darswin.lens.parameter import Number, Parameter
 from darswin.lens.solve import inverse, rising_limit
 
+MOST_LOST = 1.0  # px, by rounding
+
 
 def horner(x: Tensor, coefficients: Tensor) -> Tensor:
     """c₀ + c₁ x + c₂ x² + …, for coefficients (N, n) and x (N or 1, ...)."""
@@ -145,8 +147,21 @@ class OCamInverse(PolynomialLens):
 
     `Lens` describes the other arguments.
 
+    Raises:
+        ValueError: coefficients so large that sums of them in their dtype may be a pixel off, as
+            those of 20 terms in float32.
+
     Source: the OCamCalib toolbox, world2cam.
     """
+
+    def _validate(self) -> None:
+        super()._validate()
+        value = self.coefficients.detach()
+        # Rounding is 6 to 10 times smaller than this bound.
+        lost = horner(torch.full_like(value[:, :1], math.pi / 2), value.abs())[:, 0]
+        fits = lost * torch.finfo(value.dtype).eps < 5 * MOST_LOST
+        name = str(value.dtype).removeprefix("torch.")
+        self._require("coefficients", fits, f"such that {name} rounds r by less than a pixel")
 
     def _set_theta_max(self, wanted: Tensor | None, argument: str = "theta_max") -> None:
         super()._set_theta_max(wanted, argument)

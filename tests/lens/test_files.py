@@ -46,7 +46,7 @@ from darswin.views import up_of
     ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
     ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
     # The row comes first, and indices begin at 0.
-    ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
+    ("ocamcalib.txt", "OCam", (723.6, 715.2), (1440, 1440)),
     # The center of the upper left pixel is (0.5, 0.5).
     ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
     ("nerfstudio.json", "KannalaBrandt", (719.1 - 0.5, 962.3 - 0.5), (1920, 1440)),

@@ -92,6 +92,8 @@ def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     (Equidistant(F, 0.029, image_size=(H, W)), r"θ_max = 1.66\d°; θ_max may be in another"),
     (Equidistant(3e4, 1.7, image_size=(H, W)), "an image circle of 102000 px up to θ_max"),
     (Perspective(F, 1.57, image_size=(H, W)), "a θ_max of 89.95°"),
+    (KannalaBrandt(F, [2.0, -0.1, 3.0], 1.0, image_size=(H, W)), r"change \d\d-fold, as after"),
+    (BrownConrady(F, [9.0], 0.9, image_size=(H, W)), r"change \d\d-fold, as after"),
 ])  # fmt: skip
 def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
     assert re.search(pattern, doubts(lens)[0]), doubts(lens)[0]
@@ -198,8 +200,12 @@ def test_loading_warns_once_in_one_line(tmp_path, given):
     path.write_text(re.sub('"(width|height)": [0-9]+, ', "", in_mm(fisheye_model=1)))
     assert not warned(lambda: load(path, **given))
     assert len(warned(lambda: load(path, image_size=(960, 1280), **given))) == 1
-    path.write_text(opencv(D=FISHEYE, fisheye_model=1))
+    path.write_text(opencv(D=FISHEYE, fisheye_model=1, rms_error=0.4))
     assert not warned(lambda: load(path, theta_max=0.01))
+    for name in ("avg_reprojection_error", "RMS_error", "rms"):
+        path.write_text(opencv(D=FISHEYE, fisheye_model=1, **{name: 7.25}))
+        (said,) = warned(lambda: load(path, **given))
+        assert said.endswith("with corners that its calibration missed by 7.25 px")
 
 
 def test_many_cameras_give_one_warning(tmp_path, capsys):

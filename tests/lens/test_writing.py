@@ -1,7 +1,10 @@
 """Files written in the formats of OpenCV, COLMAP, Kalibr and our own hold the same lens."""
 
+import contextlib
 import json
+import math
 import re
+import warnings
 from itertools import product
 
 import cv2
@@ -16,7 +19,20 @@ from lens_examples import ASIDE, FILES, assert_projects, double, example, f64, p
 from torch.testing import assert_close
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Fisheye624, Spherical, from_dict, load, load_all, save, to_dict
+from darswin.lens import (
+    MODELS,
+    EnhancedUnified,
+    Equidistant,
+    FieldOfView,
+    Fisheye624,
+    Mei,
+    Spherical,
+    from_dict,
+    load,
+    load_all,
+    save,
+    to_dict,
+)
 from darswin.lens.curves import as_curves
 from darswin.lens.files.load import Calibration
 
@@ -200,6 +216,24 @@ def test_the_name_chooses_the_format(tmp_path):
     # The center of a lens without a center is the middle of its image.
     save(lens.replace(center=None), tmp_path / "a.yaml")
     assert load(tmp_path / "a.yaml").center.tolist() == [[255.5, 255.5]]
+
+
+@pytest.mark.parametrize(("model", "formats"), [
+    (Equidistant, "opencv colmap kalibr"), (Mei, ""), (FieldOfView, "colmap kalibr"),
+    (EnhancedUnified, "colmap"),
+])  # fmt: skip
+def test_programs_that_end_at_90_degrees_are_named(model, formats, tmp_path):
+    values = {"omega": 0.9, "alpha": 0.6, "beta": 1.1, "xi": 1.2, "focal": 200.0}
+    used = {name: values[name] for name in model.parameters}
+    for form, end in product(("darswin", "opencv", "colmap", "kalibr"), (1.5, 1.6)):
+        lens = model(**used, theta_max=end, image_size=(480, 640))
+        with warnings.catch_warnings(record=True) as said, contextlib.suppress(ValueError):
+            save(lens, tmp_path / "lens", form)
+        assert bool(said) == (end > 1.57 and form in formats.split())
+        assert all("no pixels for rays of 90° and more" in str(w.message) for w in said)
+    ray = np.array([[[math.sin(1.6), 0, math.cos(1.6)]]])  # to the right
+    matrix, zeros = np.diag([200.0, 200, 1]), np.zeros(4)
+    assert cv2.fisheye.projectPoints(ray, zeros[:3], zeros[:3], matrix, zeros)[0][0, 0, 0] < 0
 
 
 def test_refusals(tmp_path):

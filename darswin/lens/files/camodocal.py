@@ -14,7 +14,7 @@ from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
 from darswin.lens.files.named import PLANE, RADTAN, Named, flat
 from darswin.lens.image import Size
-from darswin.lens.polynomial import OCam, OCamInverse
+from darswin.lens.polynomial import OCam
 
 SECTIONS = ("mirror_parameters", "projection_parameters", "distortion_parameters",
             "poly_parameters", "inv_poly_parameters", "affine_parameters")  # fmt: skip
@@ -22,7 +22,7 @@ BLOCKS = (
     "the direct polynomial", "the inverse polynomial", "the center (row and column)",
     "the affine parameters (c, d, e)", "the image size (height and width)",
 )  # fmt: skip
-MOST_APART = 1.0  # px, between the two polynomials; the toolbox reaches about 0.01 px
+MOST_APART = 1.0  # px, between the two polynomials; the toolbox reaches about 0.01 px inside
 MAX_COEFFICIENTS = 64
 
 
@@ -138,25 +138,25 @@ def _ocam(
     affine: list[list[float]],
     size: tuple[int, int],
 ) -> Description:
-    """The lens of the inverse polynomial if it is given, else of the direct one."""
-    if not any(inverse):
-        return in_image(OCam, center, affine, size, {"coefficients": direct})
-    _check_inverse(direct, inverse, size)
-    return in_image(OCamInverse, center, affine, size, {"coefficients": inverse})
+    """The lens of the direct polynomial, which was calibrated. The toolbox fits the inverse one to
+    it, loses it in rounding if it has many terms, and extrapolates it before the corners."""
+    if any(inverse):
+        _check_inverse(direct, inverse, size)
+    return in_image(OCam, center, affine, size, {"coefficients": direct})
 
 
 def _check_inverse(direct: list[float], inverse: list[float], size: tuple[int, int]) -> None:
-    """Raises ValueError unless both polynomials agree up to half the image's diagonal."""
-    last = -1.0
-    for radius in np.linspace(0, math.hypot(*size) / 2, 257).tolist():
-        theta = math.atan2(radius, -polyval(radius, direct))
-        if theta <= last:
-            return  # no ray lands beyond
-        last = theta
-        found = polyval(theta - math.pi / 2, inverse)
-        if not abs(found - radius) <= MOST_APART:
-            raise ValueError(
-                f"the inverse polynomial must undo the direct one to within {MOST_APART:g} px, "
-                f"got {found:.6g} px for {radius:.6g} px; without the inverse polynomial, the "
-                "direct one is used"
-            )
+    """Raises ValueError if both polynomials differ at most radii up to half the image's diagonal:
+    then they are not of one camera."""
+    radius = np.linspace(0, math.hypot(*size) / 2, 257)
+    theta = np.arctan2(radius, -polyval(radius, direct))
+    last = int((np.diff(theta, append=-1.0) <= 0).argmax())  # no ray lands beyond
+    with np.errstate(all="ignore"):
+        found = polyval(theta - math.pi / 2, inverse)[: last + 1]
+        off = ~(abs(found - radius[: last + 1]) <= MOST_APART)
+    if off.mean() > 0.5:
+        at = int(off.argmax())
+        raise ValueError(
+            f"the inverse polynomial must undo the direct one to within {MOST_APART:g} px, got "
+            f"{found[at]:.6g} px for {radius[at]:.6g} px; the direct one alone would be used"
+        )

@@ -14,7 +14,7 @@ from darswin.lens.base import Lens, from_dict, naming_degrees, with_rounded_thet
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.camodocal import CAMODOCAL, OCamCalib
 from darswin.lens.files.content import Content, decoded, parse, read_bytes
-from darswin.lens.files.fields import Fields, listed, short
+from darswin.lens.files.fields import Fields, is_number, listed, plain_name, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.named import BASALT, KALIBR, NEIGHBOURS
 from darswin.lens.files.nerfstudio import Nerfstudio
@@ -34,6 +34,9 @@ FORMATS: tuple[Format, ...] = (
     Own(), WoodScape(), BASALT, Nerfstudio(), CAMODOCAL, KALIBR, *NEIGHBOURS, opencv.MultiView(),
     opencv.ByName(), opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
+# Names of entries with the px by which a calibration missed its corners, after `plain_name`.
+_MISSED = ("rms", "rmserror", "rmsreprojectionerror", "reprojectionerror", "avgreprojectionerror",
+           "meanreprojectionerror", "reprojerror", "meanerror")  # fmt: skip
 _UNKNOWN = "unknown format: {}. The formats are " + ", ".join(format.name for format in FORMATS)
 
 
@@ -211,7 +214,7 @@ class Calibration:
         name = self.choose(camera)
         description = self._describe(name)
         with self._about(name):
-            lens, (doubt,) = _batch([description], theta_max, image_size, dtype)
+            lens, (doubt,) = _batch([description], self._missed(), theta_max, image_size, dtype)
         return lens, "" if nominal and "image_size" not in description else doubt
 
     def lenses(
@@ -250,7 +253,8 @@ class Calibration:
         error of the first camera that has one."""
         try:
             with self._about(names[0]):
-                lenses, said = _batch([self._describe(name) for name in names], *arguments)
+                described = [self._describe(name) for name in names]
+                lenses, said = _batch(described, self._missed(), *arguments)
         except ValueError:
             if len(names) == 1:
                 raise
@@ -266,6 +270,12 @@ class Calibration:
         if "center" in description:
             description["center"] = [c - self.format.origin for c in description["center"]]
         return description
+
+    def _missed(self) -> float:
+        """px by which the calibration missed its corners; 0 if the file does not say."""
+        entries = {} if isinstance(self._fields, list) else self._fields.entries
+        said = (value for name, value in entries.items() if plain_name(str(name)) in _MISSED)
+        return next((float(value) for value in said if is_number(str(value))), 0.0)
 
     @contextmanager
     def _about(self, camera: str | None = None) -> Iterator[None]:
@@ -300,6 +310,7 @@ def _shape(value: object) -> str:
 
 def _batch(
     descriptions: list[Description],
+    missed: float,
     theta_max: float | None,
     image_size: Size,
     dtype: torch.dtype | None,
@@ -333,7 +344,7 @@ def _batch(
     if sensor is not None:
         left_top, size = sensor.split(2, 1)
         judged = judged.replace(center=judged.center_in() + left_top, image_size=size)
-    return lens, doubts(judged)
+    return lens, doubts(judged, missed)
 
 
 def reach(lens: Lens) -> Tensor:

@@ -1,8 +1,10 @@
 """Writes calibration files."""
 
 import itertools
+import math
 import os
 import re
+import warnings
 from pathlib import Path
 
 import torch
@@ -21,6 +23,17 @@ from darswin.utils.files import replace_file
 WRITTEN: dict[str, Format] = {
     "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": KALIBR
 }  # fmt: skip
+# The models that other programs know up to 90° from the axis alone.
+IN_FRONT = {
+    "darswin": "",
+    "opencv": "Equidistant KannalaBrandt",
+    "kalibr": "Equidistant KannalaBrandt FieldOfView",
+    "colmap": "Equidistant KannalaBrandt FieldOfView Fisheye624 EnhancedUnified",
+}
+
+
+class BeyondFormat(UserWarning):
+    """A warning of a lens that sees more than the program whose file holds it."""
 
 
 def save(
@@ -42,12 +55,24 @@ def save(
         supported: rad: the angle up to which corners support the lens, as `CalibratedLens` has it.
             Our own JSON keeps it beside the lens; other formats have no place for it.
 
+    Warns:
+        BeyondFormat: the lens sees more than 90° from its axis, where the format's program knows
+            no rays of its model: OpenCV's fisheye, COLMAP's models, and Kalibr's with pinhole.
+
     Raises:
         ValueError: several lenses, a lens of a model that is not in `MODELS`, a lens that the
             format cannot hold exactly, or a wrong angle.
     """
     format = format_of(path, format)
-    replace_file(path, WRITTEN[format].write(lens, Path(path).suffix.lower(), supported))
+    writer = WRITTEN[format]
+    replace_file(path, writer.write(lens, Path(path).suffix.lower(), supported))
+    end, kind = math.degrees(lens.theta_max.item()), type(lens).__name__
+    if end > 90 and kind in IN_FRONT[format].split():
+        text = (
+            f"{os.fspath(path)}: {writer.name} has no pixels for rays of 90° and more from the "
+            f"axis of a {kind} lens, and wrong rays for their pixels, but this sees {end:.4g}°"
+        )
+        warnings.warn(text, BeyondFormat, stacklevel=2)
     return format
 
 
