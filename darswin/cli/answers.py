@@ -57,6 +57,7 @@ class Answers:
     Args: channels: of the images, 1 or 3.
     """
 
+    shown = ""  # to the network, in words that follow the number of pictures
     most_lenses = 16  # whose values are kept, for folders whose pictures come from several cameras
 
     def __init__(self, channels: int):

@@ -221,11 +221,23 @@ def _predict(
                 print(text) if out is None else replace_file(out, text)
     if (wrong := answers.finish()) is not None:
         raise ValueError("\n".join([wrong, *broken.errors]))
+    if out is not None and entries:
+        print(_summary(entries, out, answers.shown))
     videos = any(file.is_video for file in files)
     what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
     count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
     broken.report(count if entries else "")
     return entries
+
+
+def _summary(entries: Sequence[Mapping[str, Any]], out: str, shown: str) -> str:
+    """How many pictures have predictions, and where; shown: what the network sees, in words."""
+    pictures = [entry for entry in entries if "frames_per_second" not in entry]
+    counts = [len(entry["detections"]) for entry in pictures if "detections" in entry]
+    text = f"{out}: {len(pictures)} picture{'s' * (len(pictures) != 1)}{shown}"
+    text += f", {sum(counts)} detection{'s' * (sum(counts) != 1)}" if counts else ""
+    drawn = any("overlay" in entry for entry in pictures)
+    return text + f"; {Path(out).parent / 'overlays'} shows them" * drawn
 
 
 def answer(file: File, lenses: Calibrations, every: int, answers: Answers) -> None:

@@ -25,6 +25,7 @@ from darswin.data.labels import Labels, open_labels, write_coco, write_yolo
 from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_instances
 from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
+from darswin.lens.files.fields import listed
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
@@ -304,6 +305,9 @@ def _write(
     bad = [new.error for new in warped if new.error]
     wrong = [*data.wrong, *lost, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
+    assert data.lenses is not None
+    cameras = listed(camera.name for camera in data.lenses.cameras)
+    print(f"pictures by {cameras}, as {settings['to']} sees them")
     print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
     large = sum(lost["fits_no_tile"] for lost in left)
     share = f"{LEAST_VISIBLE:.0%} of them"

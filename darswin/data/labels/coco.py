@@ -2,7 +2,8 @@
 
 Pictures are looked for as `file_name` says, in the folder of the file, in `images/` beside it, and
 where COCO has them: in `val2017/` or `images/val2017/` for `annotations/instances_val2017.json`. A
-calibration `lens.json` beside the file, or above `annotations/`, is the lens of all pictures.
+calibration `lens.json` beside the file, or beside its folder if the pictures are there too, is the
+lens of all pictures.
 
 Source: cocodataset.org/#format-data.
 """
@@ -93,7 +94,10 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
         if len(missing) == len(files):
             raise FileNotFoundError(f"{text}: {some(missing)}")
         wrong += [f"{path}: there is no picture {file} in {folder}" for file in missing]
-    calibration = calibration_in(path.parent, path.parent.parent)
+    # A lens.json above the data set may be that of any camera, such as the one to warp to.
+    beside, above = path.parent, path.parent.parent
+    root = os.path.commonpath([os.path.abspath(beside), os.path.abspath(folder)])
+    calibration = calibration_in(beside, *[above] * (root == os.path.abspath(above)))
     entries = list(compress(entries, there))
     return LabelledPictures(
         folder, list(compress(files, there)),

@@ -146,6 +146,8 @@ def test_a_lens_beside_the_labels_is_that_of_the_pictures(tmp_path):
     (tmp_path / "lens.json").write_text('{"model": "Equidistant", "focal": 20, "theta_max": 1}')
     lenses = read_coco(file).lenses
     assert lenses is not None and lenses.lens_of("a.png", SIZE).focal == 20
+    # One above the folder with the labels and the pictures is no part of the data set.
+    assert read_coco(write(tmp_path / "set")).lenses is None
 
 
 UNREADABLE = "has a mask that cannot be read"
