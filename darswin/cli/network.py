@@ -126,8 +126,8 @@ class NetworkAnswers(Answers):
             pixels = Pixels(tuple(mean or (0.0,)), tuple(std or (1.0,)), pixels.channels)
         pixels = pixels._replace(channels=channels or pixels.channels)
         self.view = make(self.network.size, mean=pixels.mean, std=pixels.std)
-        down, across = self.view.size
-        self.shown = f" by the view {view or VIEW} of {across} × {down} px (W × H)"
+        sides = "×".join(map(str, reversed(self.network.size or ())))
+        self.shown = f" by the view {view or VIEW}{sides and f' of {sides} px (W×H)'}"
         self._mean, self._std = (
             per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
         )
