@@ -103,7 +103,7 @@ class NetworkAnswers(Answers):
         format: Literal["json", "coco", "yolo"] | None = None,
     ):  # fmt: skip
         lowest = THRESHOLD if threshold is None else threshold
-        check("threshold", f"{lowest:g}", math.isfinite(lowest), "finite")
+        check("threshold", f"{lowest:g}", 0 <= lowest <= 1, "from 0 to 1, as scores are")
         check_statistics(mean, std)
         check("size", size, size is None or min(size) >= 1, "at least 1,1")
         self.labels = None if labels is None else read_names(labels)

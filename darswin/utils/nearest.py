@@ -7,11 +7,13 @@ LONGEST = 64  # characters that are compared
 
 
 def nearest(given: str, names: Iterable[str], count: int = 1, alike: float = 0.75) -> list[str]:
-    """At most `count` of the names, the most similar first. Their similarity, of at most 1, is
-    `alike` or more; capitals and small letters are the same."""
-    known = {name.lower(): name for name in names}
-    found = difflib.get_close_matches(given[:LONGEST].lower(), known, count, alike)
-    return [known[name] for name in found]
+    """At most `count` of the names, the most similar first. Their similarity, or that of their
+    beginnings, of at most 1, is `alike` or more; capitals and small letters are the same."""
+    given, names = given[:LONGEST].lower(), list(names)
+    beginnings = {name[: len(given) + 1].lower(): name for name in names}
+    known = beginnings | {name.lower(): name for name in names}
+    found = difflib.get_close_matches(given, known, 2 * count, alike)
+    return list(dict.fromkeys(known[name] for name in found))[:count]
 
 
 def did_you_mean(given: str, names: Iterable[str], count: int = 1, alike: float = 0.75) -> str:

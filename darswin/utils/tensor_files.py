@@ -25,6 +25,12 @@ def write_tensors(
     replace_file(path, save(dict(tensors), {**metadata, _DIGEST: digest}))
 
 
+# What to say of files of other programs, by their endings.
+_OTHERS = dict.fromkeys((".pt", ".pth", ".ckpt", ".bin"), "it is a checkpoint of torch, which may "
+    "run code: load its weights into a model in Python, and write that with save_model") | {
+    ".onnx": "it is a network for darswin.frames.Network or --network"}  # fmt: skip
+
+
 def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors of a file and its metadata.
 
@@ -57,7 +63,9 @@ def _opened(path: str | os.PathLike) -> Iterator[Any]:
         with safe_open(path, "pt") as file:
             yield file
     except SafetensorError as error:
-        raise ValueError(f"{path} cannot be read as safetensors: {error}") from error
+        suffix = os.path.splitext(path)[1]
+        advice = _OTHERS.get(suffix, f"it is no safetensors file, or damaged ({error})")
+        raise ValueError(f"{path} cannot be read as safetensors: {advice}") from error
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:

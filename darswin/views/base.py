@@ -283,7 +283,8 @@ def check_one_picture(view: View) -> None:
 def check_lens(lens: Lens | None, size: Pair) -> Lens:
     """Returns the lens if it is one for images of (H, W); its size is checked if `readable`."""
     if not isinstance(lens, Lens):
-        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
+        joined = "; lens.cat joins several" if isinstance(lens, list | tuple) else ""
+        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}{joined}")
     if lens.image_size is None or not readable(lens.image_size):
         return lens
     for other in lens.image_size.unique(dim=0).tolist():

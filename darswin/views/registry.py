@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from darswin.ops.checks import side_or_pair
+from darswin.utils.nearest import did_you_mean
 from darswin.views.base import Pair, PerChannel, View
 
 _VIEWS: dict[str, Callable[..., View]] = {}
@@ -37,7 +38,8 @@ def flat_views() -> list[str]:
 def view_class(name: str) -> Any:
     """The class with this name, or the function that makes the view; ValueError for others."""
     if name not in _VIEWS:
-        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
+        meant = did_you_mean(name, _VIEWS).rstrip(".")
+        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}{meant}")
     return _VIEWS[name]
 
 

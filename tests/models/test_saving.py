@@ -37,7 +37,7 @@ def test_files_that_are_no_model_of_ours(weights, tmp_path):
     with pytest.raises(FileNotFoundError):
         load_model(path)
     path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match=r"m\.safetensors cannot be read as safetensors"):
+    with pytest.raises(ValueError, match=r"m\.safetensors cannot be read as safetensors: it is no"):
         load_model(path)
     save_file(weights, path)
     with pytest.raises(ValueError, match="not the name of their model"):

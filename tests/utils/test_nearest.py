@@ -9,6 +9,7 @@ def test_similar_names_come_first():
     assert nearest("spherica", NAMES) == ["Spherical"] and nearest("x", NAMES) == []
     assert nearest("DARSWIN_A_SMAL", NAMES, 2, 0.7) == ["darswin_a_small", "darswin_a_tiny"]
     assert nearest("darswin_a_smal", NAMES) == ["darswin_a_small"]
+    assert nearest("Kanala", ["KannalaBrandt", "Mei"]) == ["KannalaBrandt"]
     assert len(nearest("x", NAMES, 3, 0)) == 3
     assert nearest("Mei" + "x" * 10**6, NAMES) == []
 
