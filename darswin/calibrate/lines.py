@@ -20,7 +20,7 @@ import torch
 from darswin.calibrate import boards, edges
 from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
-from darswin.calibrate.spread import RHO, USUAL, angles, deviation, misfit
+from darswin.calibrate.spread import RHO, allowed, angles, misfit
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
@@ -35,6 +35,9 @@ ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
 BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
 LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
+RATIOS = -0.04, 0.0, 0.04  # log of ratio
+WEIGHT, USUAL = 4.0, 0.5  # of beliefs in a search; 
+OBLONG = 0.003  # of the ratio of the sides of pixels, the standard deviation
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
 NARROWEST = math.radians(3)  # at the rim
 DIFFERENT = "the pictures allow very different lenses: give more of them"
@@ -134,11 +137,11 @@ def from_curves(
             if len(points) > 3 and not at_rim and from_sides.max(0).min() > FRAME * radius:
                 pieces.append(points / radius)
                 picture.append(number)
-    about = 1e-4 if center else 0.001 if circle else 0.02 if len(pieces) > ENOUGH else 0.002
+    about = 1e-4 if center else 0.003 if circle else 0.01
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
     scale = min(radius / TOLERANCE[0], 1 / TOLERANCE[1])
-    best, *_ = found = _search(_Lines(pieces, np.array(picture), scale, *known))
+    best, low, high = allowed(_search(_Lines(pieces, np.array(picture), scale, *known)))
     along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
     second = np.sort(along)[:, 1]
     if fov is None and second.max() < SECOND[0]:
@@ -163,7 +166,7 @@ def from_curves(
     if rim < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigmas = np.hypot(0.0 if fov else deviation(found), misfit(lens, shown, radius))
+    sigmas = np.hypot(np.maximum(best.curve - low, high - best.curve), misfit(lens, shown, radius))
     sigma = float(sigmas[-1])
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     spread = float((sigmas / angles(lens, radius)).max())
@@ -200,34 +203,36 @@ def _check(count: int) -> None:
 class _Lines:
     """The curves of all pictures, in radii of the image, and what is known of the lens.
 
-    A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
-    at the distance ρ from the centre (x, y). scale: of a radius, in units of TOLERANCE; center:
-    (x, y, standard deviation); rim: θ at ρ = 1; belief: (6,), is added to what is `unusual`.
+    A lens is v = (log h₀, a₁, a₂, a₃, x, y, q), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
+    at the distance ρ from the centre (x, y), for pixels whose sides are as exp q to 1. scale: of a radius, in units of TOLERANCE; center:
+    (x, y, standard deviation); rim: θ at ρ = 1; weight: of what is `unusual`.
     """
 
     def __init__(
         self, pieces: list[np.ndarray], picture: np.ndarray, scale: float, center: np.ndarray,
-        rim: float | None, belief: np.ndarray | float = 0.0,
+        rim: float | None, weight: float = WEIGHT,
     ):  # fmt: skip
         self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
-        self.rim, self.belief, self.points = rim, belief, np.concatenate(pieces)
+        self.rim, self.weight, self.points = rim, weight, np.concatenate(pieces)
         self.counts = np.array([len(piece) for piece in pieces])
         self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
 
-    def some(self, keep: np.ndarray, belief: np.ndarray | float = 0.0) -> "_Lines":
+    def some(self, keep: np.ndarray, weight: float = WEIGHT) -> "_Lines":
         kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
-        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, belief)
+        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, weight)
 
     def unusual(self, v: np.ndarray) -> np.ndarray:
-        """How far a lens is from usual ones, and from what is known."""
-        bend, about = abs(v[1]), (v[4:] - self.center[:2]) / self.center[2]
+        """How far a lens is from usual ones, in standard deviations, and from what is known."""
+        bend, about = abs(v[1]), (v[4:6] - self.center[:2]) / self.center[2]
         # Usual shapes are between those of stereographic and equidistant lenses. The bend for the
         # scale, -a₁ h₀², is 0 for perspective, 1/4 and 1/3 for these, 1/2 for orthographic lenses.
         second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
         third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
         scale = -4 * v[1] * math.exp(2 * v[0]) - 1
+        oblong = np.sign(v[6]) * math.sqrt(2 * math.log1p((v[6] / OBLONG) ** 2))  # Cauchy's loss
         off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
-        return np.array((USUAL * second, USUAL * third, USUAL * scale, *about, off)) + self.belief
+        usual = np.array((second, third, scale)) / USUAL
+        return np.array((*self.weight * np.array((*usual, *about, oblong)), off))
 
 
 def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -257,7 +262,7 @@ class _Planes:
 
     def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | float = 1.0):
         self.lines, self.v, self.rim, self.curve = lines, v, _rim(v), _angles(v, RHO)[0]
-        offset = lines.points - v[4:]
+        offset = (lines.points - v[4:6]) * np.exp((-v[6] / 2, v[6] / 2))
         self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
         sin, cos = np.sin(theta), np.cos(theta)
@@ -341,16 +346,22 @@ class _Planes:
     def moved(self, step: np.ndarray | float) -> "_Planes":
         return _Planes(self.lines, self.v + step, self.normal).orient(self.axes)
 
-    def refined(self, steps: int = 30) -> "_Planes":
-        """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Its rows and their derivatives, (rows, 7)."""
+        rows = self.moved(0).rows
+        return rows, np.stack([self.moved(d).rows - rows for d in 1e-5 * np.eye(7)], 1) / 1e-5
+
+    def refined(self, steps: int = 30, first: int = 0) -> "_Planes":
+        """The lens nearby with the least cost, by the Levenberg–Marquardt method, with all numbers
+        before the first as they are."""
         found, damping = self, 1e-3
         for _ in range(steps):
-            best, rows = found, found.moved(0).rows
-            slopes = np.stack([best.moved(d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
+            best, (rows, slopes) = found, found.slopes()
+            slopes = slopes[:, first:]
             square, slope = slopes.T @ slopes, slopes.T @ rows
             while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = best.moved(-np.linalg.solve(damped, slope))
+                trial = best.moved(np.r_[np.zeros(first), -np.linalg.solve(damped, slope)])
                 found = trial if trial.cost < best.cost else best
                 damping *= 10 if found is best else 0.1
             if found.cost > (1 - 1e-4) * best.cost:
@@ -361,26 +372,27 @@ class _Planes:
         """As a lens for pictures of (H, W)."""
         h, (a, b, c) = math.exp(self.v[0]), self.v[1:4] / radius ** np.array((1, 3, 5))
         numbers = torch.tensor([-h * radius, 0, -h * a, 0, -h * b, 0, -h * c], dtype=torch.float64)
-        return OCam(numbers, center=torch.from_numpy(radius * self.v[4:]), image_size=size)
+        return OCam(numbers, center=torch.from_numpy(radius * self.v[4:6]), image_size=size)
 
 
 def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return apart**2 / (1 + apart**2 / counts)
 
 
-def _search(lines: _Lines) -> list[_Planes]:
-    """The lenses that fit best, the best first."""
+def _search(lines: _Lines) -> _Planes:
+    """The lens that fits best."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
     shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
-    tried = [_Planes(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
+    tried = [_Planes(lines, np.array((0, *shape, *lines.center[:2], 0))) for shape in shapes]
     near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
-    shape = near.orient({}).refined()
+    ratios = (_Planes(lines, near.v + q * np.eye(7)[6]).orient({}).refined() for q in RATIOS)
+    shape = min(ratios, key=_cost)
     straight = shape.straightness < STRAIGHT**2
     _check(straight.sum())
     lines, starts = lines.some(straight), []
     for depth in DEPTHS:
         starts.append(_Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
-        if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
+        if lines.unusual(starts[-1].v)[2] > 3 * WEIGHT / USUAL:
             break
     fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
     if (known := lines.rim) is not None:
@@ -389,5 +401,4 @@ def _search(lines: _Lines) -> list[_Planes]:
     for _ in range(3):
         fits = [fit.refined(5) for fit in fits]
         fits = [min(fit, _Planes(lines, fit.v).orient(), key=_cost) for fit in fits]
-    least = min(map(_cost, fits))
-    return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)
+    return min((fit.refined() for fit in fits), key=_cost)

@@ -10,10 +10,11 @@ import torch
 from darswin.lens import Lens, fit
 
 RHO = np.linspace(0.05, 1, 20)  # of the radius: where curves are compared
-GROUPS = 8  # of curves; the answers without each of them show the uncertainty
+SIGMAS = 2.0  # standard deviations
+SCALES = 0.03, 0.08, 0.15, 0.3, 0.6  # of the logarithm of h₀, from the best
+ROUNDS = 3  # if a profile has a better lens than the best one
 FAMILIES = "Spherical", "KannalaBrandt"  # models that suit most lenses
 REAL = 0.005  # of θ: by which real cameras are no round lens with square pixels
-USUAL = 10.0  # the weight of what usual lenses are like
 
 
 def angles(lens: Lens, radius: float) -> np.ndarray:
@@ -35,24 +36,39 @@ def misfit(lens: Lens, seen: Lens, radius: float) -> np.ndarray:
     return np.hypot(apart, REAL * found)
 
 
-def deviation(fits: list[Any]) -> np.ndarray:
-    """(20,) rad: the standard deviation of θ of the first of some fits to lines. By the jackknife
-    over groups of neighbouring curves, whose errors are alike, and by other beliefs on usual lenses
-    and on the centre."""
-    lines, best = fits[0].lines, fits[0]
+def allowed(best: Any) -> tuple[Any, np.ndarray, np.ndarray]:
+    """The best lens, and (20,) rad: the least and the largest θ that the lines allow.
 
-    def curve(keep: np.ndarray, belief: np.ndarray | float = 0.0) -> np.ndarray:
-        some = lines.some(keep, belief)
-        near = (type(best)(some, f.v).orient(f.axes).refined(8) for f in fits)
-        return min(near, key=attrgetter("cost")).curve
-
-    x, y = np.array([piece.mean(0) for piece in lines.pieces]).T - best.v[4:, None]
-    group = np.empty(len(x), int)
-    group[np.lexsort((np.arctan2(y, x), lines.picture))] = np.arange(len(x)) * GROUPS // len(x)
-    without = [curve(group != k) for k in range(GROUPS)]
-    # How far lenses differ from `usual` ones and their centres from the middle. Few curves do not
-    # show a centre that is 2 % off, as those of cameras often are.
-    off = 10 if 0.001 < lines.center[2] < 0.01 else 5
-    beliefs = np.diag((0.5 * USUAL, 0.5 * USUAL, 0.4 * USUAL, off, off, 0))[:5]
-    changes = [curve(group >= 0, belief) - best.curve for belief in beliefs]
-    return np.sqrt((GROUPS - 1) * np.var(without, 0) + np.square(changes).sum(0))
+    This is the profile of the cost: for each scale, all else is found again, also which lines are
+    orthogonal. The errors along a curve are alike, so a curve counts as one observation.
+    """
+    planes, lines = type(best), best.lines
+    for _ in range(ROUNDS):
+        noise = (best.rows**2)[: len(lines.points) + len(lines.counts)].sum() / len(lines.counts)
+        lines = lines.some(lines.counts > 0, float(np.sqrt(noise)))
+        best = planes(lines, best.v, best.normal).orient(best.axes).refined()
+        trials, ends = [best], [best.curve]
+        for sign in (-1, 1):
+            near, before = best, 0.0
+            for step in SCALES:
+                v = np.r_[best.v[0] + sign * step, near.v[1:]]
+                tried = planes(lines, v, near.normal).orient(near.axes), planes(lines, v).orient()
+                trials.append(min(tried, key=attrgetter("cost")).refined(8, 1))
+                rise = np.sqrt(max(trials[-1].cost - best.cost, 0.0) / noise)
+                part = (SIGMAS - before) / max(rise - before, 1e-9)
+                ends.append(near.curve + min(part, 1) * (trials[-1].curve - near.curve))
+                if rise > SIGMAS:
+                    break
+                near, before = trials[-1], rise
+        lowest = min(trials, key=attrgetter("cost"))
+        if lowest.cost > best.cost - 0.1 * noise:
+            break
+        best = lowest
+    slopes, turns = best.slopes()[1][:, 1:], np.eye(7)[1:]
+    change = np.stack([best.moved(1e-5 * d).curve - best.curve for d in turns], 1) / 1e-5
+    rest = SIGMAS * np.sqrt(((change @ np.linalg.pinv(slopes.T @ slopes)) * change).sum(1) * noise)
+    return (
+        best,
+        best.curve - np.hypot(best.curve - np.min(ends, 0), rest),
+        best.curve + np.hypot(np.max(ends, 0) - best.curve, rest),
+    )
