@@ -32,10 +32,10 @@ FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a
 TOLERANCE = 0.3, 1 / 800  # px, at least, and of the radius: by which a line misses
 STRAIGHT = 3.0  # times TOLERANCE: curves that miss by more are not lines
 ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
-BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
-LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
+BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 24)  # a₁ and h₀ that are tried
+LONGEST, LIKELY, LOWS = 12, 5, 2  # curves, their directions and the depths that are looked into
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
-RATIOS = -0.04, 0.0, 0.04  # log of ratio
+RATIOS = -0.05, 0.0, 0.05  # log of ratio
 WEIGHT, USUAL = 4.0, 0.5  # of beliefs in a search; 
 OBLONG = 0.003  # of the ratio of the sides of pixels, the standard deviation
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
@@ -351,17 +351,19 @@ class _Planes:
         rows = self.moved(0).rows
         return rows, np.stack([self.moved(d).rows - rows for d in 1e-5 * np.eye(7)], 1) / 1e-5
 
-    def refined(self, steps: int = 30, first: int = 0) -> "_Planes":
-        """The lens nearby with the least cost, by the Levenberg–Marquardt method, with all numbers
-        before the first as they are."""
+    def refined(self, steps: int = 30, free: Sequence[int] = range(7)) -> "_Planes":
+        """The lens nearby with the least cost, by the Levenberg–Marquardt method. free: the indices
+        of the numbers of v that change."""
         found, damping = self, 1e-3
         for _ in range(steps):
             best, (rows, slopes) = found, found.slopes()
-            slopes = slopes[:, first:]
+            slopes = slopes[:, free]
             square, slope = slopes.T @ slopes, slopes.T @ rows
             while damping < 1e6 and found is best:
                 damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = best.moved(np.r_[np.zeros(first), -np.linalg.solve(damped, slope)])
+                step = np.zeros(7)
+                step[free] = -np.linalg.solve(damped, slope)
+                trial = best.moved(step)
                 found = trial if trial.cost < best.cost else best
                 damping *= 10 if found is best else 0.1
             if found.cost > (1 - 1e-4) * best.cost:
@@ -383,21 +385,26 @@ def _search(lines: _Lines) -> _Planes:
     """The lens that fits best."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
     shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
-    tried = [_Planes(lines, np.array((0, *shape, *lines.center[:2], 0))) for shape in shapes]
-    near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
-    ratios = (_Planes(lines, near.v + q * np.eye(7)[6]).orient({}).refined() for q in RATIOS)
-    shape = min(ratios, key=_cost)
-    straight = shape.straightness < STRAIGHT**2
+    lines, starts = lines.some(lines.counts > 0, 1.0), []
+    for ratio in RATIOS:
+        tried = [_Planes(lines, np.array((0, *s, *lines.center[:2], ratio))) for s in shapes]
+        near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
+        starts.append(near.orient({}).refined(free=range(6)))
+    shapes = starts
+    straight = np.min([shape.straightness for shape in shapes], 0) < STRAIGHT**2
     _check(straight.sum())
-    lines, starts = lines.some(straight), []
-    for depth in DEPTHS:
-        starts.append(_Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
-        if lines.unusual(starts[-1].v)[2] > 3 * WEIGHT / USUAL:
-            break
-    fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
+    lines, fits = lines.some(straight), []
+    for shape in shapes:
+        starts = []
+        for depth in DEPTHS:
+            starts.append(_Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
+            if lines.unusual(starts[-1].v)[2] > 3 * WEIGHT / USUAL:
+                break
+        around = [starts[max(k - 2, 0) : k + 3] for k in range(len(starts))]
+        lows = [s for s, near in zip(starts, around, strict=True) if s is min(near, key=_cost)]
+        fits += sorted(lows, key=_cost)[:LOWS]
     if (known := lines.rim) is not None:
-        fits = [min(starts, key=lambda start: abs(start.rim - known))]
-    fits = sorted(fits, key=_cost)[:LOWS]
+        fits = [min(fits, key=lambda start: abs(start.rim - known))]
     for _ in range(3):
         fits = [fit.refined(5) for fit in fits]
         fits = [min(fit, _Planes(lines, fit.v).orient(), key=_cost) for fit in fits]

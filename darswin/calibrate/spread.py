@@ -10,7 +10,7 @@ import torch
 from darswin.lens import Lens, fit
 
 RHO = np.linspace(0.05, 1, 20)  # of the radius: where curves are compared
-SIGMAS = 2.0  # standard deviations
+SIGMAS = 3.0  # standard deviations
 SCALES = 0.03, 0.08, 0.15, 0.3, 0.6  # of the logarithm of h₀, from the best
 ROUNDS = 3  # if a profile has a better lens than the best one
 FAMILIES = "Spherical", "KannalaBrandt"  # models that suit most lenses
@@ -53,13 +53,13 @@ def allowed(best: Any) -> tuple[Any, np.ndarray, np.ndarray]:
             for step in SCALES:
                 v = np.r_[best.v[0] + sign * step, near.v[1:]]
                 tried = planes(lines, v, near.normal).orient(near.axes), planes(lines, v).orient()
-                trials.append(min(tried, key=attrgetter("cost")).refined(8, 1))
-                rise = np.sqrt(max(trials[-1].cost - best.cost, 0.0) / noise)
-                part = (SIGMAS - before) / max(rise - before, 1e-9)
-                ends.append(near.curve + min(part, 1) * (trials[-1].curve - near.curve))
-                if rise > SIGMAS:
-                    break
-                near, before = trials[-1], rise
+                trial = min(tried, key=attrgetter("cost")).refined(8, range(1, 7))
+                rise = np.sqrt(max(trial.cost - best.cost, 0.0) / noise)
+                if before <= SIGMAS or rise <= SIGMAS:
+                    part = (SIGMAS - before) / (rise - before) if max(rise, before) > SIGMAS else 1
+                    ends.append(near.curve + part * (trial.curve - near.curve))
+                near, before = trial, rise
+                trials.append(trial)
         lowest = min(trials, key=attrgetter("cost"))
         if lowest.cost > best.cost - 0.1 * noise:
             break
