@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -143,7 +143,7 @@ def from_curves(
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
     scale = min(radius / TOLERANCE[0], 1 / TOLERANCE[1])
-    best, off = _allowed(_search(Lines(pieces, np.array(picture), scale, *known)))
+    best, apart = _allowed(_search(Lines(pieces, np.array(picture), scale, *known)))
     along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
     second = np.sort(along)[:, 1]
     if fov is None and second.max() < SECOND[0]:
@@ -153,21 +153,22 @@ def from_curves(
         )
     raw, last = best.lens(size, radius), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
-    names = FORMS if model == "auto" else (model,)
-    closest = [kept for name in names if (kept := _closest(name, raw, theta))]
-    if not closest:
+    fits = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
+    fits = {name: fitted for name, fitted in fits.items() if fitted}
+    form = min(fits, key=lambda name: fits[name][1], default=model) if model == "auto" else model
+    if form not in fits:
         raise CalibrationError(
             f"no {model} lens is close to what the lines show: give more pictures, or another model"
         )
-    error, form, lens = min(closest, key=itemgetter(0))
-    lens = lens.with_theta_max(None)
-    at = torch.from_numpy(radius * RHO).clamp(max=lens.r_max.item())
-    angles = lens.unproject(at[None])[0].numpy()
+    lens, error = fits[form]
+    angles = _curve(lens, radius)
+    # Where no lines are, other forms show what they leave open.
+    others = [_curve(fits[name][0], radius) - angles for name in FORMS[:2] if name in fits]
+    misfit = np.abs([angles - best.curve, *others]).max(0)
     if (rim := float(angles[-1])) < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    # The form of the lens differs from the curve, and real cameras from round lenses.
-    sigmas = np.linalg.norm((off, angles - best.curve, REAL * angles), axis=0)
+    sigmas = np.linalg.norm((apart, misfit, REAL * angles), axis=0)
     sigma, spread = float(sigmas[-1]), float((sigmas / angles).max())
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
@@ -195,14 +196,21 @@ def from_curves(
     return Estimate(lens, rim, radius, (low, high), spread, count, covered, verdict, said)
 
 
-def _closest(name: str, raw: OCam, theta: Tensor) -> tuple[float, str, Lens] | None:
-    """px, a model's name, and its lens that is closest up to θ."""
+def _closest(name: str, raw: OCam, theta: Tensor) -> tuple[Lens, float] | None:
+    """The lens of a model that is closest up to θ, without a θ_max, and px by which it is off."""
     kind, terms = ("OCam", 2) if name == "Division" else (name, min(MODELS[name].terms, 2))
     for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
         with suppress(ValueError):
             lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
-            return error.item(), name, lens
+            return lens.with_theta_max(None), error.item()
     return None
+
+
+def _curve(lens: Lens, radius: float) -> np.ndarray:
+    """(20,) rad: θ at `RHO` times a radius in px."""
+    return lens.unproject(torch.from_numpy(radius * RHO).clamp(max=lens.r_max.item())[None])[
+        0
+    ].numpy()
 
 
 def _check(count: int) -> None:
