@@ -173,7 +173,9 @@ def from_curves(
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
     oriented = (second >= SECOND[0]).sum()
-    source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
+    unsure = sigma > UNSURE * rim or spread > OPEN
+    sets = "hardly set" if unsure else "set"
+    source = f"orthogonal directions in {oriented} of {len(curves)} pictures {sets} the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
@@ -184,7 +186,7 @@ def from_curves(
     auto = "" if model == "auto" else ", and the model auto may be closer"
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        DIFFERENT: sigma > UNSURE * rim or spread > OPEN,
+        DIFFERENT: unsure,
         f"{form} is up to {error:.1f} px from what the lines show{auto}": error > OFF,
         f"pixels are not square: {ratio:.3f} along x is 1 along y, as the lens has it": oblong,
         f"only {second.max()} lines of a picture have a second direction": few,

@@ -59,7 +59,7 @@ def estimate(
     if out is not None and not (estimated.is_sure or accept_doubts):
         raise ValueError(
             f"{out} is not written, because the pictures allow very different lenses: give more "
-            "pictures, or --accept_doubts true"
+            "pictures, --fov_deg of the image circle, or --accept_doubts true"
         )
     if out is not None:
         write_lens(estimated.lens, out, None)
