@@ -87,10 +87,10 @@ def pictures_of(name: str, count: int) -> list[np.ndarray]:
 
 @contextmanager
 def searching_once() -> Iterator[None]:
-    """The search and its deviation do not depend on the model: each runs once for some curves."""
-    search, deviation, known = lines._search, lines.deviation, {}
+    """The search and what lines allow do not depend on the model: each runs once for curves."""
+    search, allowed, known = lines._search, lines._allowed, {}
 
-    def once(work: Callable, given: object, of: lines._Lines) -> object:
+    def once(work: Callable, given: object, of: lines.Lines) -> object:
         key = work, of.points.tobytes()
         if key not in known:
             known[key] = work(given)
@@ -98,7 +98,7 @@ def searching_once() -> Iterator[None]:
 
     with (
         mock.patch.object(lines, "_search", lambda of: once(search, of, of)),
-        mock.patch.object(lines, "deviation", lambda fits: once(deviation, fits, fits[0].lines)),
+        mock.patch.object(lines, "_allowed", lambda best: once(allowed, best, best.lines)),
     ):
         yield
 

@@ -16,28 +16,32 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from darswin.calibrate import boards, edges
 from darswin.calibrate.circle import image_circle
 from darswin.calibrate.inputs import CalibrationError
-from darswin.calibrate.spread import RHO, USUAL, angles, deviation, misfit
+from darswin.calibrate.planes import RHO, STRAIGHT, TOLERANCE, USUAL, WEIGHT, Lines, Planes
 from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
 
-MOST, FEWEST, ENOUGH = 120, 10, 300  # curves: of a picture, of all, and to find the centre too
+MOST, FEWEST = 120, 10  # curves: of a picture, and of all
 STEP = 4  # points of an edge that are averaged
 FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
-TOLERANCE = 0.3, 1 / 800  # px, at least, and of the radius: by which a line misses
-STRAIGHT = 3.0  # times TOLERANCE: curves that miss by more are not lines
-ORTHOGONAL = 4.0  # the weight of directions, compared with straightness
-BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 30)  # a₁ and h₀ that are tried
-LONGEST, LIKELY, LOWS = 12, 5, 5  # curves, their directions and the depths that are looked into
+BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 24)  # a₁ and h₀ that are tried
+LOWS = 2  # depths that are looked into, for each ratio
 UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
+OPEN, REAL = 0.25, 0.005  # of any angle: more is unsure; less is not known of real cameras
+RATIOS, CLOSE = (-0.05, 0.0, 0.05), 1.5  # q; times the least cost: what is looked into
 SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
+SIGMAS, ROUNDS = 3.0, 3  # of an interval; of its search, if that has a better lens
+SCALES = 0.03, 0.08, 0.15, 0.3, 0.6  # of the logarithm of h₀, from the best
 NARROWEST = math.radians(3)  # at the rim
-DIFFERENT = "the pictures allow very different lenses: give more of them"
+MORE = "give more pictures, or the field of view of the image circle if it is visible"
+DIFFERENT = f"the pictures do not set the scale, and allow very different lenses: {MORE}"
+FORMS = "Spherical", "KannalaBrandt", "Division"  # that "auto" tries
 _cost = attrgetter("cost")
 
 
@@ -48,8 +52,8 @@ class Estimate:
     Attributes:
         lens: one lens in float64.
         rim: rad, its θ at `radius`, px: at the image circle, or at the nearest side without one.
-        interval: rad: the least and the largest θ at the rim, one standard deviation around it.
-        spread: the largest standard deviation of θ up to the rim, as a part of θ.
+        interval: rad: the least and the largest θ at the rim that the lines allow.
+        spread: how far θ may be off, anywhere up to the rim, as a part of θ.
         curves: the number of curves that are straight with this lens.
         covered: the part of the radius, in [0, 1], on which they lie.
         verdict: what supports the lens, in one sentence; doubts: sentences on what does not.
@@ -76,7 +80,7 @@ class Estimate:
 
 
 def estimate(
-    pictures: Sequence[np.ndarray], model: str = "Spherical", *,
+    pictures: Sequence[np.ndarray], model: str = "auto", *,
     center: tuple[float, float] | None = None, fov: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Estimate:  # fmt: skip
@@ -84,17 +88,18 @@ def estimate(
 
     Args:
         pictures: (H, W) or (H, W, 3), uint8, all of one size and one camera.
-        model: a name in `darswin.lens.MODELS`; or "Division", the `OCam` lens with [a₀, 0, a₂].
+        model: a name in `darswin.lens.MODELS`; "Division", the `OCam` lens with [a₀, 0, a₂]; or
+            "auto": of it, Spherical and KannalaBrandt, the closest to what the lines show.
         center: (x, y) px, if it is known. Otherwise it is near the middle of the image circle, or
             of the picture.
         fov: rad, the field of view of the visible image circle, if it is known.
         progress: a function that is called with lines of text.
 
     Raises:
-        CalibrationError: too few lines, or lines that do not determine the lens.
+        CalibrationError: too few lines, or lines that do not determine the lens or its scale.
         ValueError: an unknown model, or pictures of several sizes, or below 16 px.
     """
-    if model not in MODELS and model != "Division":
+    if model not in (*MODELS, "Division", "auto"):
         raise ValueError(unknown_model(model))
     if fov is not None:
         check("fov", fov, 0 < fov < 2 * math.pi, "above 0 and below 2π")
@@ -116,7 +121,7 @@ def estimate(
 
 
 def from_curves(
-    curves: Sequence[Sequence[np.ndarray]], size: tuple[int, int], model: str = "Spherical", *,
+    curves: Sequence[Sequence[np.ndarray]], size: tuple[int, int], model: str = "auto", *,
     center: tuple[float, float] | None = None, fov: float | None = None,
     circle: tuple[float, float, float] | None = None,
 ) -> Estimate:  # fmt: skip
@@ -134,52 +139,56 @@ def from_curves(
             if len(points) > 3 and not at_rim and from_sides.max(0).min() > FRAME * radius:
                 pieces.append(points / radius)
                 picture.append(number)
-    about = 1e-4 if center else 0.001 if circle else 0.02 if len(pieces) > ENOUGH else 0.002
+    about = 1e-4 if center else 0.003 if circle else 0.01
     known = np.array((x / radius, y / radius, about)), fov and fov / 2
     _check(len(pieces))
     scale = min(radius / TOLERANCE[0], 1 / TOLERANCE[1])
-    best, *_ = found = _search(_Lines(pieces, np.array(picture), scale, *known))
+    best, apart = _allowed(_search(Lines(pieces, np.array(picture), scale, *known)))
     along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
     second = np.sort(along)[:, 1]
     if fov is None and second.max() < SECOND[0]:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
-            "in two orthogonal directions: give other pictures, or the image circle's field of view"
+            f"in two orthogonal directions: {MORE}"
         )
     raw, last = best.lens(size, radius), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
-    kind, terms = ("OCam", 2) if model == "Division" else (model, min(MODELS[model].terms, 2))
-    for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
-        with suppress(ValueError):
-            shown = raw.with_theta_max(part * theta)
-            lens, error = fit(kind, shown, terms=terms)
-            break
-    else:
+    fits = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
+    fits = {name: fitted for name, fitted in fits.items() if fitted}
+    form = min(fits, key=lambda name: fits[name][1], default=model) if model == "auto" else model
+    if form not in fits:
         raise CalibrationError(
             f"no {model} lens is close to what the lines show: give more pictures, or another model"
         )
-    lens = lens.with_theta_max(None)
-    rim = lens.unproject(min(radius, lens.r_max.item())).item()
-    if rim < NARROWEST:
+    lens, error = fits[form]
+    angles = _curve(lens, radius)
+    # Where no lines are, other forms show what they leave open.
+    others = [_curve(fits[name][0], radius) - angles for name in FORMS[:2] if name in fits]
+    misfit = np.abs([angles - best.curve, *others]).max(0)
+    if (rim := float(angles[-1])) < NARROWEST:
         raise CalibrationError("the lines do not determine a lens: give more pictures")
     lens = lens.with_theta_max(rim if circle else reach(lens))
-    sigmas = np.hypot(0.0 if fov else deviation(found), misfit(lens, shown, radius))
-    sigma = float(sigmas[-1])
+    sigmas = np.linalg.norm((apart, misfit, REAL * angles), axis=0)
+    sigma, spread = float(sigmas[-1]), float((sigmas / angles).max())
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
-    spread = float((sigmas / angles(lens, radius)).max())
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
     oriented = (second >= SECOND[0]).sum()
-    source = f"orthogonal directions in {oriented} of {len(curves)} pictures set the scale"
+    unsure = sigma > UNSURE * rim or spread > OPEN
+    sets = "hardly set" if unsure else "set"
+    source = f"orthogonal directions in {oriented} of {len(curves)} pictures {sets} the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
         + f", and known to {spread:.1%} at any radius below"
     )
+    ratio, oblong = math.exp(best.v[6]), raw.affine is not None
+    auto = "" if model == "auto" else ", and the model auto may be closer"
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
-        DIFFERENT: sigma > UNSURE * rim,
-        f"{model} is up to {error.item():.1f} px from what the lines show": error.item() > OFF,
+        DIFFERENT: unsure,
+        f"{form} is up to {error:.1f} px from what the lines show{auto}": error > OFF,
+        f"pixels are not square: {ratio:.3f} along x is 1 along y, as the lens has it": oblong,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
         f"no line is beyond {last:.0%} of the radius, where the lens is a guess": last < COVERED,
@@ -187,6 +196,23 @@ def from_curves(
     said = tuple(doubt for doubt, holds in doubts.items() if holds)
     count = len(best.normal)
     return Estimate(lens, rim, radius, (low, high), spread, count, covered, verdict, said)
+
+
+def _closest(name: str, raw: OCam, theta: Tensor) -> tuple[Lens, float] | None:
+    """The lens of a model that is closest up to θ, without a θ_max, and px by which it is off."""
+    kind, terms = ("OCam", 2) if name == "Division" else (name, min(MODELS[name].terms, 2))
+    for part in (1.0, 0.95, 0.9, 0.85, 0.8):  # some models do not reach the corners of pictures
+        with suppress(ValueError):
+            lens, error = fit(kind, raw.with_theta_max(part * theta), terms=terms)
+            return lens.with_theta_max(None), error.item()
+    return None
+
+
+def _curve(lens: Lens, radius: float) -> np.ndarray:
+    """(20,) rad: θ at `RHO` times a radius in px."""
+    return lens.unproject(torch.from_numpy(radius * RHO).clamp(max=lens.r_max.item())[None])[
+        0
+    ].numpy()
 
 
 def _check(count: int) -> None:
@@ -197,197 +223,66 @@ def _check(count: int) -> None:
         )
 
 
-class _Lines:
-    """The curves of all pictures, in radii of the image, and what is known of the lens.
-
-    A lens is v = (log h₀, a₁, a₂, a₃, x, y), with tan θ = ρ / (h₀ (1 + a₁ ρ² + a₂ ρ⁴ + a₃ ρ⁶))
-    at the distance ρ from the centre (x, y). scale: of a radius, in units of TOLERANCE; center:
-    (x, y, standard deviation); rim: θ at ρ = 1; belief: (6,), is added to what is `unusual`.
-    """
-
-    def __init__(
-        self, pieces: list[np.ndarray], picture: np.ndarray, scale: float, center: np.ndarray,
-        rim: float | None, belief: np.ndarray | float = 0.0,
-    ):  # fmt: skip
-        self.pieces, self.picture, self.scale, self.center = pieces, picture, scale, center
-        self.rim, self.belief, self.points = rim, belief, np.concatenate(pieces)
-        self.counts = np.array([len(piece) for piece in pieces])
-        self.of = {p: np.nonzero(picture == p)[0] for p in np.unique(picture).tolist()}
-
-    def some(self, keep: np.ndarray, belief: np.ndarray | float = 0.0) -> "_Lines":
-        kept = [piece for piece, k in zip(self.pieces, keep, strict=True) if k]
-        return _Lines(kept, self.picture[keep], self.scale, self.center, self.rim, belief)
-
-    def unusual(self, v: np.ndarray) -> np.ndarray:
-        """How far a lens is from usual ones, and from what is known."""
-        bend, about = abs(v[1]), (v[4:] - self.center[:2]) / self.center[2]
-        # Usual shapes are between those of stereographic and equidistant lenses. The bend for the
-        # scale, -a₁ h₀², is 0 for perspective, 1/4 and 1/3 for these, 1/2 for orthographic lenses.
-        second = (v[2] + 0.1 * bend**2) / (0.5 * bend**2 + 0.02)
-        third = (v[3] + 0.03 * bend**3) / (0.3 * bend**3 + 0.005)
-        scale = -4 * v[1] * math.exp(2 * v[0]) - 1
-        off = 0.0 if self.rim is None else 1e4 * (_rim(v) - self.rim)
-        return np.array((USUAL * second, USUAL * third, USUAL * scale, *about, off)) + self.belief
-
-
-def _angles(v: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """θ at ρ, and its derivative."""
-    s, h = rho * rho, math.exp(v[0])
-    depth = h * (1 + s * (v[1] + s * (v[2] + s * v[3])))
-    deepens = h * 2 * s * (v[1] + s * (2 * v[2] + s * 3 * v[3]))  # ρ times the derivative
-    return np.arctan2(rho, depth), np.maximum((depth - deepens) / (s + depth**2), 1e-3)
-
-
-def _rim(v: np.ndarray) -> float:
-    return float(_angles(v, np.ones(1))[0][0])
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
-class _Planes:
-    """For a lens v, the plane through the camera that is closest, in px, to each curve.
-
-    In units of TOLERANCE: miss, of the points; straightness: (C,), its mean square for each curve.
-    normal: (C, 3), of the planes, with the signs of `like`. After `orient`, axes: three orthogonal
-    directions (3, 3) of each picture; along: (C,), the number of a curve's direction, or -1; agree:
-    in [0, 1], how many have one; rows of the least-squares problem; cost.
-    """
-
-    def __init__(self, lines: _Lines, v: np.ndarray, like: np.ndarray | float = 1.0):
-        self.lines, self.v, self.rim, self.curve = lines, v, _rim(v), _angles(v, RHO)[0]
-        offset = lines.points - v[4:]
-        self.rho = rho = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-        (theta, slope), unit = _angles(v, rho), offset / rho[:, None]
-        sin, cos = np.sin(theta), np.cos(theta)
-        ray = np.column_stack((sin[:, None] * unit, cos))
-        # The derivatives of rays along and across the radius.
-        along = np.column_stack((cos[:, None] * unit, -sin)) * slope[:, None]
-        across = np.column_stack((-unit[:, 1], unit[:, 0], 0 * rho)) * (sin / rho)[:, None]
-        outer = lines.scale**2 * (ray[:, :, None] * ray[:, None]).reshape(-1, 9)
-        starts, weight = np.cumsum(lines.counts) - lines.counts, rho / (slope * sin)
-        for _ in range(3):
-            scatter = np.add.reduceat(weight[:, None] * outer, starts).reshape(-1, 3, 3)
-            spread, self.own = np.linalg.eigh(scatter)
-            normal = self.own[:, :, 0].repeat(lines.counts, 0)
-            weight = 1 / ((normal * along).sum(1) ** 2 + (normal * across).sum(1) ** 2)
-        self.miss = lines.scale * (normal * ray).sum(1) * np.sqrt(weight)
-        self.straightness = np.add.reduceat(self.miss**2, starts) / lines.counts
-        sign = np.sign((self.own[:, :, 0] * like).sum(1) + 1e-9)  # a plane has two normals
-        self.own *= sign[:, None, None]
-        self.miss *= sign.repeat(lines.counts)
-        self.normal, self.spread = self.own[:, :, 0], np.maximum(spread[:, 1:], 1e-9)
-
-    def from_directions(self, directions: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """How far, with a sign, curves (K,) are from directions (..., 3), as an array (K, ...)."""
-        part = np.tensordot(self.own[of], directions, ((1,), (-1,)))
-        spread = self.spread[of].reshape(len(of), 2, *[1] * (directions.ndim - 1))
-        return part[:, 0] / np.sqrt((part[:, 1:] ** 2 / spread).sum(1) + 1e-30)
-
-    def nearest_of(self, axes: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`from_directions` and the number of the nearest of axes (3, 3) to each of curves (K,)."""
-        apart = self.from_directions(axes, of)
-        nearest = np.abs(apart).argmin(1)
-        return apart[np.arange(len(of)), nearest], nearest
-
-    def best_axes(self, of: np.ndarray) -> np.ndarray:
-        """The directions that suit the curves of a picture, of those of pairs of long curves."""
-        counts = self.lines.counts[of]
-        normal = self.normal[of[np.argsort(-counts, kind="stable")[:LONGEST]]]
-        i, j = np.triu_indices(len(normal), 1)
-        first = _unit(np.cross(normal[i], normal[j]))[:, None]
-        second = _unit(np.cross(first, normal))
-        first = np.broadcast_to(first, second.shape)
-        axes = np.stack((first, second, np.cross(first, second)), -2).reshape(-1, 3, 3)
-        apart = np.abs(self.from_directions(axes, of)).min(-1).T
-        likely = _robust(apart, counts).sum(1).argsort(kind="stable")[:LIKELY]
-        turned = [self.turned(axes[k], of) for k in likely]
-        return min(turned, key=lambda t: _robust(self.nearest_of(t, of)[0], counts).sum())
-
-    def turned(self, axes: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Directions near `axes` that fit the curves of a picture better."""
-        for _ in range(2):
-            apart, number = self.nearest_of(axes, of)
-            nearest, normal = axes[number], self.normal[of]
-            sine = (normal * nearest).sum(1)
-            weight = apart / np.where(np.abs(sine) > 1e-12, sine, 1)
-            weight /= 1 + apart**2 / self.lines.counts[of]
-            rows = weight[:, None] * np.cross(nearest, normal)
-            turn = np.linalg.lstsq(rows, -weight * sine, rcond=1e-6)[0]
-            turn /= max(1, 10 * np.linalg.norm(turn))
-            u, _, vh = np.linalg.svd(axes + np.cross(turn, axes))
-            axes = u @ vh
-        return axes
-
-    def orient(self, axes: dict[int, np.ndarray] | None = None) -> "_Planes":
-        """Itself with all attributes, from directions nearby or from the best."""
-        counts, of = self.lines.counts, self.lines.of
-        if axes is None:
-            axes = {p: self.best_axes(curves) for p, curves in of.items() if len(curves) > 2}
-        self.axes = {p: self.turned(near, of[p]) for p, near in axes.items() if p in of}
-        apart, self.along = np.zeros(len(counts)), np.full(len(counts), -1)
-        for p, found in self.axes.items():
-            apart[of[p]], self.along[of[p]] = self.nearest_of(found, of[p])
-        self.along[apart**2 > STRAIGHT**2 * counts] = -1
-        self.agree = 1 - _robust(apart, counts).sum() / counts.sum()
-        # A curve that misses its plane or its direction by more than TOLERANCE counts little.
-        bends = self.miss / np.sqrt(1 + self.straightness).repeat(counts)
-        turns = math.sqrt(ORTHOGONAL) * apart / np.sqrt(1 + apart**2 / counts)
-        self.rows = np.concatenate((bends, turns, self.lines.unusual(self.v)))
-        self.cost = self.rows @ self.rows
-        return self
-
-    def moved(self, step: np.ndarray | float) -> "_Planes":
-        return _Planes(self.lines, self.v + step, self.normal).orient(self.axes)
-
-    def refined(self, steps: int = 30) -> "_Planes":
-        """The lens nearby with the least cost, by the Levenberg–Marquardt method."""
-        found, damping = self, 1e-3
-        for _ in range(steps):
-            best, rows = found, found.moved(0).rows
-            slopes = np.stack([best.moved(d).rows - rows for d in 1e-5 * np.eye(6)], 1) / 1e-5
-            square, slope = slopes.T @ slopes, slopes.T @ rows
-            while damping < 1e6 and found is best:
-                damped = square + damping * np.diag(np.diag(square) + 1e-9)
-                trial = best.moved(-np.linalg.solve(damped, slope))
-                found = trial if trial.cost < best.cost else best
-                damping *= 10 if found is best else 0.1
-            if found.cost > (1 - 1e-4) * best.cost:
-                break
-        return found
-
-    def lens(self, size: tuple[int, int], radius: float) -> OCam:
-        """As a lens for pictures of (H, W)."""
-        h, (a, b, c) = math.exp(self.v[0]), self.v[1:4] / radius ** np.array((1, 3, 5))
-        numbers = torch.tensor([-h * radius, 0, -h * a, 0, -h * b, 0, -h * c], dtype=torch.float64)
-        return OCam(numbers, center=torch.from_numpy(radius * self.v[4:]), image_size=size)
-
-
-def _robust(apart: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    return apart**2 / (1 + apart**2 / counts)
-
-
-def _search(lines: _Lines) -> list[_Planes]:
-    """The lenses that fit best, the best first."""
+def _search(lines: Lines) -> Planes:
+    """The lens that fits best."""
     # First the shape alone, like that of stereographic or of equidistant lenses.
-    shapes = [(a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
-    tried = [_Planes(lines, np.array((0, *shape, *lines.center[:2]))) for shape in shapes]
+    usual = [(0, a, c * a**2 / -5, c * a**3 * 2 / 35) for a in BENDS for c in (0, 1)]
+    lines = lines.some(lines.counts > 0, 1.0)
+    tried = [Planes(lines, np.array((*shape, *lines.center[:2], 0))) for shape in usual]
     near = min(tried, key=lambda t: (lines.counts * np.minimum(t.straightness, 1)).sum())
-    shape = near.orient({}).refined()
-    straight = shape.straightness < STRAIGHT**2
+    ratios = (Planes(lines, np.r_[near.v[:6], q]).orient({}) for q in RATIOS)
+    shapes = [start.refined(free=range(6)) for start in ratios]
+    shapes = [shape for shape in shapes if shape.cost < CLOSE * min(map(_cost, shapes))]
+    straight = np.min([shape.straightness for shape in shapes], 0) < STRAIGHT**2
     _check(straight.sum())
-    lines, starts = lines.some(straight), []
-    for depth in DEPTHS:
-        starts.append(_Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
-        if lines.unusual(starts[-1].v)[2] > 3 * USUAL:
-            break
-    fits = [s for k, s in enumerate(starts) if s is min(starts[max(k - 2, 0) : k + 3], key=_cost)]
+    lines, fits = lines.some(straight), []
+    for shape in shapes:
+        starts = []
+        for depth in DEPTHS:
+            starts.append(Planes(lines, np.array((math.log(depth), *shape.v[1:]))).orient())
+            if lines.unusual(starts[-1].v)[2] > 3 * WEIGHT / USUAL:
+                break
+        around = [starts[max(k - 2, 0) : k + 3] for k in range(len(starts))]
+        lows = [s for s, near in zip(starts, around, strict=True) if s is min(near, key=_cost)]
+        fits += sorted(lows, key=_cost)[:LOWS]
     if (known := lines.rim) is not None:
-        fits = [min(starts, key=lambda start: abs(start.rim - known))]
-    fits = sorted(fits, key=_cost)[:LOWS]
+        fits = [min(fits, key=lambda start: abs(start.rim - known))]
     for _ in range(3):
         fits = [fit.refined(5) for fit in fits]
-        fits = [min(fit, _Planes(lines, fit.v).orient(), key=_cost) for fit in fits]
-    least = min(map(_cost, fits))
-    return sorted((fit.refined() for fit in fits if fit.cost < 1.3 * least), key=_cost)
+        fits = [min(fit, Planes(lines, fit.v).orient(), key=_cost) for fit in fits]
+    return min((fit.refined() for fit in fits), key=_cost)
+
+
+def _allowed(best: Planes) -> tuple[Planes, np.ndarray]:
+    """The best lens, and (20,) rad: how far θ may be off at `RHO` times the radius.
+
+    This is the profile of the cost: for each scale, all else is found again, also which lines are
+    orthogonal. The errors along a curve are alike, so a curve counts as one observation.
+    """
+    lines = best.lines
+    for _ in range(ROUNDS):
+        rows = best.rows[: len(lines.points) + len(lines.counts)]
+        noise = rows @ rows / len(lines.counts) + 1e-9
+        lines = lines.some(lines.counts > 0, float(np.sqrt(noise)))
+        best = Planes(lines, best.v, best.normal).orient(best.axes).refined()
+        trials, ends = [best], [best.curve]
+        for sign in (-1, 1):
+            near, before = best, 0.0
+            for step in SCALES:
+                v = np.r_[best.v[0] + sign * step, near.v[1:]]
+                tried = Planes(lines, v, near.normal).orient(near.axes), Planes(lines, v).orient()
+                trial = min(tried, key=_cost).refined(8, range(1, 7))
+                rise = np.sqrt(max(trial.cost - best.cost, 0.0) / noise)
+                if min(before, rise) <= SIGMAS:
+                    part = 1 if max(before, rise) <= SIGMAS else (SIGMAS - before) / (rise - before)
+                    ends.append(near.curve + part * (trial.curve - near.curve))
+                near, before = trial, rise
+                trials.append(trial)
+        if min(map(_cost, trials)) > best.cost - 0.1 * noise:
+            break
+        best = min(trials, key=_cost)
+    # At one scale, the other numbers of the lens are as uncertain as their linear problem says.
+    slopes, steps = best.slopes()[1][:, 1:], 1e-5 * np.eye(7)[1:]
+    change = np.stack([best.moved(step).curve - best.curve for step in steps], 1) / 1e-5
+    rest = noise * ((change @ np.linalg.pinv(slopes.T @ slopes)) * change).sum(1)
+    return best, np.hypot(np.abs(ends - best.curve).max(0), SIGMAS * np.sqrt(rest))

@@ -12,7 +12,7 @@ from darswin.utils.parameters import check
 
 
 def estimate(
-    pictures: Sequence[str] = (), *, out: str | None = None, model: str = "Spherical",
+    pictures: Sequence[str] = (), *, out: str | None = None, model: str = "auto",
     fov_deg: float | None = None, center: tuple[float, float] | None = None,
     report: str | None = None, accept_doubts: bool = False,
 ) -> None:  # fmt: skip
@@ -22,8 +22,8 @@ def estimate(
         pictures: pictures of one camera, or folders of them.
         out: the calibration file to write. Its ending names the format, as for `darswin lens
             convert`.
-        model: the lens model, a name of darswin.lens.MODELS, or Division: an OCam lens with two
-            coefficients.
+        model: the lens model, a name of darswin.lens.MODELS; Division, an OCam lens with two
+            coefficients; or auto: of it, Spherical and KannalaBrandt, the closest to the lines.
         fov_deg: the field of view of the visible image circle in degrees, if you know it.
         center: the principal point x,y in px, if you know it. The default is near the middle.
         report: a JSON file to write, with the lens, its angle at the rim and what supports it.
@@ -59,7 +59,7 @@ def estimate(
     if out is not None and not (estimated.is_sure or accept_doubts):
         raise ValueError(
             f"{out} is not written, because the pictures allow very different lenses: give more "
-            "pictures, or --accept_doubts true"
+            "pictures, --fov_deg of the image circle, or --accept_doubts true"
         )
     if out is not None:
         write_lens(estimated.lens, out, None)
