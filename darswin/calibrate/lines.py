@@ -153,8 +153,8 @@ def from_curves(
         )
     raw, last = best.lens(size, radius), best.rho.max()
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
-    fits = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
-    fits = {name: fitted for name, fitted in fits.items() if fitted}
+    tried = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
+    fits = {name: fitted for name, fitted in tried.items() if fitted is not None}
     form = min(fits, key=lambda name: fits[name][1], default=model) if model == "auto" else model
     if form not in fits:
         raise CalibrationError(
