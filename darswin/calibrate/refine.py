@@ -26,8 +26,9 @@ MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # distance in standard deviations; the smallest gain of a round. ROUGH follows the worst corners.
 # AGAIN starts where FINE has ended, with a part of the pictures.
 ROUGH, FINE, AGAIN = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5), (0.5, MEDIAN, 1e-3)
-# The shape of a board, by which its points (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
-BEND, STRETCH = ("bend[0]", "bend[1]"), ("stretch",)
+# More than a model has: the ratio of a pixel's sides; and the shape of a board, by which its points
+# (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
+PIXELS, BEND, STRETCH = ("affine[3]",), ("bend[0]", "bend[1]"), ("stretch",)
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
 HELD: dict[tuple[type[Lens], str], Any] = {
     (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
@@ -38,19 +39,18 @@ HELD: dict[tuple[type[Lens], str], Any] = {
 class Free:
     """The free numbers of a lens and of the board as a vector (n,), and the lens of a vector.
 
-    Free are the parameters of the model and the principal point; unless pixels are square, the
-    ratio of their sides; and the numbers of the board's shape with the names `shape`. OCam's linear
-    term stays 0, and a table's angles stay as they are.
+    Free are the parameters of the model, the principal point, and those of PIXELS, BEND and STRETCH
+    that `more` names. OCam's linear term stays 0, and a table's angles stay as they are.
     """
 
-    def __init__(self, lens: Lens, square_pixels: bool, shape: Sequence[str] = ()):
+    def __init__(self, lens: Lens, more: Sequence[str] = ()):
         tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
         tensors["center"] = lens.center
         held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
         for (model, name), places in HELD.items():
             if isinstance(lens, model):
                 held[name][places] = True
-        if not square_pixels:
+        if PIXELS[0] in more:
             tensors["affine"] = lens._affine()
             held["affine"] = torch.tensor([[True, True], [True, False]])
         free = ~torch.cat([value.flatten() for value in held.values()])
@@ -67,7 +67,8 @@ class Free:
         self.start, self._rest = vector[free], torch.where(free, 0, vector)
         self._places = torch.eye(len(vector)).to(vector)[:, free]
         # The lens has no part in the numbers of the board, which come last.
-        self.names += shape
+        shape = [name for name in (*BEND, *STRETCH) if name in more]
+        self.names, self.more = self.names + shape, [*more]
         self.shaped = torch.tensor([name in shape for name in (*BEND, *STRETCH)])
         self.start, self._places = (F.pad(x, (0, len(shape))) for x in (self.start, self._places))
         self.low, self.high = (
@@ -100,6 +101,11 @@ class Free:
         """(3,): the shape of the board of a vector (n,)."""
         count = int(self.shaped.sum())
         return vector.new_zeros(3).masked_scatter(self.shaped, vector[len(vector) - count :])
+
+    def vector(self, shape: Tensor) -> Tensor:
+        """(n,): the numbers of the lens, with the shape of the board, (3,)."""
+        own = shape[self.shaped]
+        return torch.cat((self.start[: len(self.start) - len(own)], own))
 
     def held(self, vector: Tensor, side: Tensor) -> Tensor:
         """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""

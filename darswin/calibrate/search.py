@@ -23,6 +23,7 @@ from darswin.calibrate.refine import (
     FINE,
     MEDIAN,
     OFF,
+    PIXELS,
     ROUGH,
     SHARPEST,
     STRETCH,
@@ -50,8 +51,8 @@ ASIDE = {"BrownConrady": {"tangential": 2}, "Mei": {"tangential": 2},
          "Fisheye624": {"tangential": 2, "prism": 4}}  # fmt: skip
 FOLDS = 5  # parts of the pictures, of which each is left out once
 FINALISTS, CLOSE = 3, 1.25  # models that are fitted to parts; their left_out, by the best
-PIXELS = ("affine[3]",)  # the ratio of a pixel's sides
 HOPELESS = 4.0  # times the standard deviation of a corner from another model
+TIMES = 3  # that PIXELS, BEND and STRETCH are tried, as each changes what is sure of the others
 
 
 def calibrate(
@@ -107,9 +108,18 @@ def calibrate(
     failed: list[tuple[str, float, float, str]] = []
     for kind in kinds:
         say(f"Refining the lens: {kind.__name__}")
+        usual = min([WRONG * max(size) / HOPELESS, *(one.sigma for one in found)])
+        # Terms of a model may imitate what is of the pixels or the board, so each starts with that.
+        more = list(PIXELS) * (square_pixels is False)
+        more = min(found, key=lambda one: one.sigma).free.more if found else more
         try:
-            usual = min([WRONG * max(size) / HOPELESS, *(one.sigma for one in found)])
-            found.append(_find(kind, terms, views, start, size, square_pixels is not False, usual))
+            one = _find(kind, terms, views, start, size, more, usual)
+            for _ in range(TIMES * (one.sigma <= HOPELESS * max(usual, SHARPEST))):
+                other = one.with_more(views, square_pixels)
+                if other is one or (accept and accept(one.state.lens) > accept(other.state.lens)):
+                    break
+                one = other
+            found.append(one)
         except (CalibrationError, torch.linalg.LinAlgError) as error:
             reason = (
                 error if isinstance(error, CalibrationError) else "Its equations have no solution."
@@ -126,12 +136,9 @@ def calibrate(
     found.sort(key=lambda one: one.left_out)
     taken = [one for one in found if accept is None or accept(one.state.lens)] or found
     close = [one for one in taken if not one.left_out > CLOSE * taken[0].left_out][:FINALISTS]
-    for k, one in enumerate(close):
+    for one in close:
         say(f"Leaving out pictures: {one.free.model.__name__}")
-        other = one.with_more(views, counts, square_pixels)
-        if accept is None or not accept(one.state.lens) or accept(other.state.lens):
-            found[found.index(one)] = close[k] = other
-        close[k].leave_out(views, counts)
+        one.leave_out(views, counts)
     best = _simplest(close)
     found.sort(key=lambda one: (one is not best, one.left_out))
     table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
@@ -261,42 +268,47 @@ class _Found:
                 self.squares[part] = torch.where(counts[part], miss, 0.0).sum(1)
         self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
 
-    def with_more(self, views: Views, counts: Tensor, square_pixels: bool | None) -> "_Found":
-        """The same with the ratio of a pixel's sides and the shape of the board, as far as they
-        are significant, if they predict left-out pictures better, to first order."""
-        names, confounded = self._significant(views, counts, square_pixels is None)
-        if not names:
+    def with_more(self, views: Views, square_pixels: bool | None) -> "_Found":
+        """The same with those of PIXELS, BEND and STRETCH that are significant, and without others,
+        if that predicts left-out pictures better, to first order."""
+        counts = self.fits(self.sigma)
+        more, confounded = self._significant(views, counts, square_pixels)
+        self.confounded = confounded and STRETCH[0] in more
+        if {*more} == {*self.free.more}:
             return self
-        square = square_pixels is not False and PIXELS[0] not in names
-        free = Free(self.state.lens, square, [name for name in names if name not in PIXELS])
-        state = State(free.start, *self.state[1:])
+        lens, poses = self.state.lens, (self.state.rotations, self.state.translations)
+        free, state = _state(lens, more, poses, self.state.shape)
         state, scale = refine(
             views._replace(seen=views.seen & self.used[:, None]), free, state, stages=[FINE]
         )
         other = _Found(free, state, scale, views, self.used)
-        other.judge(views, counts)
-        other.confounded = confounded and STRETCH[0] in names
-        return other if other.left_out < self.left_out else self
+        for one in (self, other):
+            one.judge(views, counts)
+        fewer = len(more) < len(self.free.more)
+        return other if fewer or other.left_out < self.left_out else self
 
-    def _significant(self, views: Views, counts: Tensor, pixels: bool) -> tuple[list[str], bool]:
-        """The names of the ratio of a pixel's sides, if it may change, and of the numbers of the
-        board's shape that are no chance, to first order; and whether boards that never turn in the
-        picture cannot tell its stretch from that of the pixels."""
-        open_ = [*[PIXELS] * pixels, BEND, STRETCH]
+    def _significant(
+        self, views: Views, counts: Tensor, square_pixels: bool | None
+    ) -> tuple[list[str], bool]:
+        """The names of the numbers of the pixels and of the board's shape that are no chance, to
+        first order; and whether boards that never turn in the picture cannot tell its stretch from
+        that of the pixels."""
+        held = list(PIXELS) * (square_pixels is False)
+        open_ = [*[PIXELS] * (square_pixels is None), BEND, STRETCH]
         extra = {name for group in open_ for name in group}
-        square = not pixels and PIXELS[0] not in self.free.names
-        free, confounded = Free(self.state.lens, square, (*BEND, *STRETCH)), False
+        free, confounded = Free(self.state.lens, (*held, *extra)), False
+        vector = free.vector(self.state.shape)
         miss, counts, slopes, _ = self._normal(views, counts, free)
         low, high = free.low, free.high
         while open_:
             stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
-            free.low, free.high = (torch.where(stay, free.start, end) for end in (low, high))
-            normal = Normal(slopes, miss, counts.to(miss), free, free.start).damped(0.0)
-            step, covariance = normal.steps()[0], normal.covariance()
+            free.low, free.high = (torch.where(stay, vector, end) for end in (low, high))
+            normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
+            step, covariance = normal.steps()[0, : len(vector)], normal.covariance()
             sure = {}
             for group in open_:
                 at = [free.names.index(name) for name in group]
-                value = step[at]
+                value = (vector + step)[at] - float(group == PIXELS)  # a ratio of 1 is none
                 squared = value @ torch.linalg.solve(covariance[at][:, at], value)
                 sure[group] = squared.sqrt().item() / max(self.sigma, SHARPEST)
             chance = [group for group in open_ if not sure[group] > OFF]
@@ -305,14 +317,14 @@ class _Found:
             both = PIXELS in chance and STRETCH in chance
             confounded |= both
             open_.remove(PIXELS if both else min(chance, key=lambda group: sure[group]))
-        return [name for group in open_ for name in group], confounded
+        return [*held, *(name for group in open_ for name in group)], confounded
 
     def _normal(
         self, views: Views, counts: Tensor, free: Free
     ) -> tuple[Tensor, Tensor, Tensor, Normal]:
         """Misses, counts, slopes and equations of the pictures with corners that count, (P, K)."""
         used = counts.any(1)
-        vector = self.state.vector if free is self.free else free.start
+        vector = self.state.vector if free is self.free else free.vector(self.state.shape)
         slopes = views.of(used).slopes(free, self.state.of(used)._replace(vector=vector))
         miss, counts = self.miss[used], counts[used]
         normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
@@ -330,18 +342,21 @@ def _simplest(found: list[_Found]) -> _Found:
     return best
 
 
-def _state(lens: Lens, square_pixels: bool, poses: tuple[Tensor, Tensor]) -> tuple[Free, State]:
-    """The free numbers of a lens, and the state with these poses."""
-    free = Free(lens, square_pixels)
-    whole = free.lens(free.start)
+def _state(
+    lens: Lens, more: Sequence[str], poses: tuple[Tensor, Tensor], shape: Tensor
+) -> tuple[Free, State]:
+    """The free numbers of a lens, and the state with these poses and the board's shape, (3,)."""
+    free = Free(lens, more)
+    vector = free.vector(shape)
+    whole = free.lens(vector)
     if whole is None:
         raise CalibrationError(f"No {free.model.__name__} lens is close to the start.")
-    return free, State(free.start, whole, *poses)
+    return free, State(vector, whole, *poses, free.shape(vector))
 
 
 def _find(
     model: type[Lens], terms: int | None, views: Views, start: radial.Start,
-    size: tuple[int, int], square_pixels: bool, usual: float,
+    size: tuple[int, int], more: Sequence[str], usual: float,
 ) -> _Found:  # fmt: skip
     """The lens of a model and the poses, from all pictures that agree. It stays rough where corners
     are much farther off than the `usual` standard deviation, px."""
@@ -349,13 +364,13 @@ def _find(
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
     poses = radial.poses(rays, views.seen.to(rays), board)
-    free, state = _state(start.lens(model, terms, top, size), square_pixels, poses)
+    free, state = _state(start.lens(model, terms, top, size), more, poses, views.board.new_zeros(3))
     agreeing = views._replace(seen=views.seen & used[:, None])
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
     if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
         free, state = _state(
-            state.lens.replace(**zeros), square_pixels, (state.rotations, state.translations)
+            state.lens.replace(**zeros), more, (state.rotations, state.translations), state.shape
         )
         state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
@@ -367,7 +382,7 @@ def _find(
         # Each pose anew from its rays: some may be mirrored, some pictures may fit after all.
         rays = state.lens.unproject_points(views.corners)
         there = (views.seen & ~rays.isnan().any(-1)).to(rays)
-        again = State(*state[:2], *radial.poses(rays.nan_to_num(), there, board))
+        again = State(*state[:2], *radial.poses(rays.nan_to_num(), there, board), state.shape)
         again, _ = refine(views, free, again, lens_moves=False)
         loss, other = (losses(views.miss(x), scale).sum(1) for x in (state, again))
         better = other < loss - 0.1

@@ -283,7 +283,7 @@ def test_left_out_is_the_error_of_pictures_that_were_left_out():
         shift = (found.translations[k : k + 1] + found.rotations[k : k + 1] @ middle) / unit
         lens = rest.lens.with_theta_max(None)
         state = State(rest._vector, lens, found.rotations[k : k + 1], shift)
-        state, _ = refine(views, Free(lens, True), state, lens_moves=False)
+        state, _ = refine(views, Free(lens), state, lens_moves=False)
         total += views.miss(state).square().sum().item()
         count += int(there.sum())
     assert found.left_out == pytest.approx(math.sqrt(total / count), rel=0.01)
