@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate import radial
+from darswin.calibrate.boards import QUESTION
 from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts, misshapen
 from darswin.calibrate.inputs import (
@@ -100,6 +101,7 @@ def calibrate(
     kinds = [_kind(name) for name in (CANDIDATES if model == "auto" else [model])]
     if terms is not None:
         check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
+    question = getattr(board, "question", QUESTION)
     usable = usable_pictures(whole, size, names)
     views = whole.of(usable)
     say(f"Finding a start from {len(views.seen)} pictures")
@@ -126,7 +128,7 @@ def calibrate(
             )
             failed.append((kind.__name__, math.nan, math.nan, str(reason)))
     if not found:
-        raise CalibrationError(failed[0][3])
+        raise naming(CalibrationError(f"{failed[0][3]} {question}"), "first_tag", "gap")
     # A corner that fits any model counts for all: no model may leave out the rim or pictures.
     most = max(one.used.sum() for one in found)
     sigma = min(one.sigma for one in found if one.used.sum() == most)
@@ -153,6 +155,9 @@ def calibrate(
 
     lens, seen = best.state.lens, views.seen
     supported = theta[best.fits(best.sigma)].quantile(0.99).item()
+    if best.sigma > WRONG * sum(size) / 2:
+        off = f"{MEDIAN * best.sigma:.3g} px or more off the best lens. {question}"
+        raise naming(CalibrationError(f"Half of the corners are {off}"), "first_tag", "gap")
     steady = best.steadiness(views, counts, supported)
     lens = lens.with_theta_max(reach(lens))
     result = CalibratedLens(
@@ -396,8 +401,7 @@ def _find(
         before, used = used, typical <= OFF * sigma
         if used.sum() < LEAST_PICTURES:
             raise CalibrationError(
-                f"Only {int(used.sum())} pictures agree on a {model.__name__} lens: are the board "
-                "and the order of its corners right?"
+                f"Only {int(used.sum())} pictures agree on one {model.__name__} lens."
             )
         if torch.equal(before, used) and not better[used].any():
             break

@@ -106,8 +106,11 @@ def test_grids_may_begin_with_another_tag():
     np.testing.assert_allclose(find_corners(picture, board), board.points + 29.5, atol=1.0)
     other = Board.april_grid(2, 2, 60.0, 18.0)
     assert np.isnan(find_corners(picture, other)).all()
-    said = "markers 30 to 33 of APRILTAG_36h11, but the first tag of the board is 0"
+    said = "markers 30 to 33 of APRILTAG_36h11, but the board has 0 to 3: is its first tag 30?"
     assert shown_instead(picture, other) == said
+    near = Board.april_grid(2, 2, 60.0, 18.0, first_tag=29)
+    assert shown_instead(picture, near).endswith("the board has 29 to 32: is its first tag 30?")
+    assert "`first_tag` 29 to 32, with a `gap` of 18" in near.question
 
 
 def test_corners_between_slanted_squares_are_where_edges_cross_or_not_found():

@@ -178,7 +178,7 @@ def test_the_best_model_predicts_left_out_pictures(usual, best):
     assert best.models[0][0] == type(best.lens).__name__
     assert best.left_out == best.models[0][1] <= 1.02 * table["KannalaBrandt"][0]
     assert table["Equisolid"][0] > 2 * best.left_out
-    assert "the axis, but a Perspective lens ends at 90°" in table["Perspective"][1]
+    assert "the axis, but Perspective lenses end at 90°" in table["Perspective"][1]
     assert ray_errors(best.lens, usual.lens, best=True).median() < 0.04
 
 

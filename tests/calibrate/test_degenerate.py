@@ -43,7 +43,7 @@ ERRORS = {
     "another board": (lambda c, b: (c, board(7, 5)), {},
                       r"`corners` must be of shape \(P, 35, 2\), got"),
     "turned board": (lambda c, b: (c, board(6, 9)), {},
-                     "are the board and the order of its corners right"),
+                     "Are the board and the order of its corners right"),
     "one point": (lambda c, b: (c[:, :1], b[:1]), {}, "A board needs 8 points or more"),
     "no point": (lambda c, b: (c[:, :0], b[:0]), {}, "A board needs 8 points or more"),
     "a line": (lambda c, b: (c[:, :9], b[:9]), {}, "not on one line, got 9"),
@@ -59,7 +59,7 @@ ERRORS = {
     "one place": (lambda c, b: (c * 0 + 300, b), {}, "At least 3 pictures .* got 0"),
     "narrow model": (lambda c, b: (rig(true_lens("KannalaBrandt", 220), 6).corners, b),
                      {"model": "Orthographic"},
-                     r"corners reach \d+° from the axis, but an? Orthographic lens ends at 90°"),
+                     r"corners reach \d+° from the axis, but Orthographic lenses end at 90°"),
 }  # fmt: skip
 
 
