@@ -203,9 +203,9 @@ class _Found:
     """A lens of one model with the poses, and what is known of them."""
 
     error = left_out = math.nan
+    squares = torch.tensor([math.nan])  # the sum of the squared misses in each picture left out
     confounded = False  # the board's stretch may be that of the pixels
     joint: Tensor
-    squares: Tensor
 
     def __init__(self, free: Free, state: State, scale: float, views: Views, used: Tensor):
         self.free, self.state, self.scale, self.used = free, state, scale, used
@@ -220,7 +220,8 @@ class _Found:
         return self.counts & (self.distance <= OFF * max(sigma, SHARPEST))
 
     def judge(self, views: Views, counts: Tensor) -> None:
-        """Computes the covariance and the errors, over the corners that count, (P, K)."""
+        """Computes the covariance and the errors, over the corners that count, (P, K): to first
+        order, `squares` and `left_out` are of a lens without the pictures of each place."""
         place = views.of(counts.any(1)).group
         miss, counts, slopes, normal = self._normal(views, counts, self.free)
         self.joint = self.sigma**2 * normal.covariance()
@@ -228,7 +229,8 @@ class _Found:
         if place.max() >= LEAST_PICTURES:
             steps = normal.steps(place)
             moved = miss + (slopes @ steps[:, None, :, None])[..., 0]
-            self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
+            self.squares = (counts * moved.square().sum(-1)).sum(1)
+            self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
 
     def steadiness(self, views: Views, counts: Tensor, top: float) -> Steadiness:
         """Whether the pictures agree, over the corners that count, (P, K), up to an angle, rad."""
@@ -244,8 +246,7 @@ class _Found:
         return Steadiness(len(without), *spread, *grown)
 
     def leave_out(self, views: Views, counts: Tensor) -> None:
-        """Computes `squares` (P,), the sums of the squared misses in each picture of a lens that
-        was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
+        """The same by fits to parts of the pictures; NaN for too few."""
         pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
         place = views.of(pictures).group
@@ -275,7 +276,7 @@ class _Found:
 
     def with_more(self, views: Views, square_pixels: bool | None) -> "_Found":
         """The same with those of PIXELS, BEND and STRETCH that are significant, and without others,
-        if that predicts left-out pictures better, to first order."""
+        as far as that predicts left-out pictures better, to first order."""
         counts = self.fits(self.sigma)
         more, confounded = self._significant(views, counts, square_pixels)
         self.confounded = confounded and STRETCH[0] in more
@@ -289,8 +290,7 @@ class _Found:
         other = _Found(free, state, scale, views, self.used)
         for one in (self, other):
             one.judge(views, counts)
-        fewer = len(more) < len(self.free.more)
-        return other if fewer or other.left_out < self.left_out else self
+        return _simplest([self, other])
 
     def _significant(
         self, views: Views, counts: Tensor, square_pixels: bool | None
