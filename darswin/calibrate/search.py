@@ -303,19 +303,27 @@ class _Found:
         extra = {name for group in open_ for name in group}
         free, confounded = Free(self.state.lens, (*held, *extra)), False
         vector = free.vector(self.state.shape)
+        used = counts.any(1)
         miss, counts, slopes, _ = self._normal(views, counts, free)
+        place = views.of(used).group
+        without = miss.new_zeros(int(place.max()) + 1, len(vector))
         low, high = free.low, free.high
         while open_:
             stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
             free.low, free.high = (torch.where(stay, vector, end) for end in (low, high))
             normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
-            step, covariance = normal.steps()[0, : len(vector)], normal.covariance()
+            step = normal.steps()[0, : len(vector)]
+            # By the noise, and by what changes where the pictures of a place are left out.
+            apart = without.index_put((place,), normal.steps(place)[:, : len(vector)] - step)
+            covariance = (
+                max(self.sigma, SHARPEST) ** 2 * normal.covariance()[:-3, :-3] + apart.mT @ apart
+            )
             sure = {}
             for group in open_:
                 at = [free.names.index(name) for name in group]
                 value = (vector + step)[at] - float(group == PIXELS)  # a ratio of 1 is none
                 squared = value @ torch.linalg.solve(covariance[at][:, at], value)
-                sure[group] = squared.sqrt().item() / max(self.sigma, SHARPEST)
+                sure[group] = squared.sqrt().item()
             chance = [group for group in open_ if not sure[group] > OFF]
             if not chance:
                 break
