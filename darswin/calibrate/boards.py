@@ -89,12 +89,8 @@ class Board:
     @property
     def question(self) -> str:
         """What to ask where its corners do not fit."""
-        if self.kind != "april":
-            return QUESTION
-        return (
-            f"{QUESTION} It is taken to have AprilTags from `first_tag` {self.first_tag} to "
-            f"{self.markers[-1]}, with a `gap` of {self.other:g}."
-        )
+        tags = f"from `first_tag` {self.first_tag} to {self.markers[-1]}, `gap` {self.other:g}"
+        return QUESTION + f" Its AprilTags are taken to run {tags}." * (self.kind == "april")
 
     @property
     def reach(self) -> float:

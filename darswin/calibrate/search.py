@@ -12,30 +12,11 @@ from darswin.calibrate import radial
 from darswin.calibrate.boards import QUESTION
 from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts, misshapen
-from darswin.calibrate.inputs import (
-    LEAST_PICTURES,
-    CalibrationError,
-    checked,
-    usable_pictures,
-)
+from darswin.calibrate.inputs import LEAST_PICTURES, CalibrationError, checked, usable_pictures
 from darswin.calibrate.refine import (
-    AGAIN,
-    BEND,
-    FINE,
-    MEDIAN,
-    OFF,
-    PIXELS,
-    ROUGH,
-    SHARPEST,
-    STRETCH,
-    Free,
-    Normal,
-    State,
-    Views,
-    losses,
-    refine,
-    weights_of,
-)
+    AGAIN, BEND, FINE, MEDIAN, OFF, PIXELS, ROUGH, SHARPEST, STRETCH, Free, Normal, State, Views,
+    losses, refine, weights_of,
+)  # fmt: skip
 from darswin.calibrate.steady import FEW, Steadiness, growth, unsure
 from darswin.lens import MODELS, Lens
 from darswin.lens.base import unknown_model
@@ -122,11 +103,10 @@ def calibrate(
                     break
                 one = other
             found.append(one)
-        except (CalibrationError, torch.linalg.LinAlgError) as error:
-            reason = (
-                error if isinstance(error, CalibrationError) else "Its equations have no solution."
-            )
-            failed.append((kind.__name__, math.nan, math.nan, str(reason)))
+        except CalibrationError as error:
+            failed.append((kind.__name__, math.nan, math.nan, str(error)))
+        except torch.linalg.LinAlgError:
+            failed.append((kind.__name__, math.nan, math.nan, "Its equations have no solution."))
     if not found:
         raise naming(CalibrationError(f"{failed[0][3]} {question}"), "first_tag", "gap")
     # A corner that fits any model counts for all: no model may leave out the rim or pictures.
@@ -161,7 +141,7 @@ def calibrate(
     steady = best.steadiness(views, counts, supported)
     lens = lens.with_theta_max(reach(lens))
     result = CalibratedLens(
-        lens=lens,
+        lens=lens, names=names, parameters=best.free.names, covariance=best.joint[:-3, :-3],
         rotations=all_pictures(best.state.rotations),
         translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
         board=unit * views.shaped(best.state.shape) + spot,
@@ -170,20 +150,11 @@ def calibrate(
         weights=all_pictures(weights_of(miss, best.scale) * (seen & best.used[:, None]), 0.0),
         theta=all_pictures(torch.where(seen, theta, torch.nan)),
         used=all_pictures(best.used, False),
-        names=names,
-        sigma=best.sigma,
-        error=best.error,
-        left_out=best.left_out,
-        supported=supported,
-        unsure=max(steady.noise, steady.scatter),
-        parameters=best.free.names,
-        covariance=best.joint[:-3, :-3],
-        models=table if model == "auto" else [],
-        doubts=[],
-        _free=best.free,
-        _vector=best.state.vector,
-        _joint=best.joint,
-    )
+        sigma=best.sigma, error=best.error, left_out=best.left_out,
+        supported=supported, unsure=max(steady.noise, steady.scatter),
+        models=table if model == "auto" else [], doubts=[],
+        _free=best.free, _vector=best.state.vector, _joint=best.joint,
+    )  # fmt: skip
     result.doubts.extend(doubts(result, whole.seen, spot, steady))
     result.doubts.extend(misshapen(result, best.state.shape, best.confounded))
     return result
@@ -222,8 +193,7 @@ class _Found:
     def judge(self, views: Views, counts: Tensor) -> None:
         """Computes the covariance and the errors, over the corners that count, (P, K): to first
         order, `squares` and `left_out` are of a lens without the pictures of each place."""
-        place = views.of(counts.any(1)).group
-        miss, counts, slopes, normal = self._normal(views, counts, self.free)
+        place, miss, counts, slopes, normal = self._normal(views, counts, self.free)
         self.joint = self.sigma**2 * normal.covariance()
         self.error = miss[counts].square().sum(-1).mean().sqrt().item()
         if place.max() >= LEAST_PICTURES:
@@ -235,8 +205,7 @@ class _Found:
     def steadiness(self, views: Views, counts: Tensor, top: float) -> Steadiness:
         """Whether the pictures agree, over the corners that count, (P, K), up to an angle, rad."""
         mine, n = views.of(counts.any(1)), len(self.state.vector)
-        place = mine.group
-        miss, counts, slopes, normal = self._normal(views, counts, self.free)
+        place, miss, counts, slopes, normal = self._normal(views, counts, self.free)
         without = miss.new_zeros(int(place.max()) + 1, n)
         if len(without) >= FEW:
             without[place] = normal.steps(place)[:, :n]
@@ -247,7 +216,7 @@ class _Found:
 
     def leave_out(self, views: Views, counts: Tensor) -> None:
         """The same by fits to parts of the pictures; NaN for too few."""
-        pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
+        pictures = counts.any(1).nonzero()[:, 0]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
         place = views.of(pictures).group
         # The order of the pictures does not change the parts.
@@ -260,12 +229,8 @@ class _Found:
             if len(rest) < LEAST_PICTURES:
                 continue
             with contextlib.suppress(torch.linalg.LinAlgError):
-                without, _ = refine(
-                    views._replace(seen=seen).of(rest),
-                    self.free,
-                    self.state.of(rest),
-                    stages=[AGAIN],
-                )
+                mine = views._replace(seen=self.counts).of(rest)
+                without, _ = refine(mine, self.free, self.state.of(rest), stages=[AGAIN])
                 poses = self.state.of(part)
                 state = without._replace(rotations=poses.rotations, translations=poses.translations)
                 mine = views.of(part)
@@ -279,14 +244,11 @@ class _Found:
         as far as that predicts left-out pictures better, to first order."""
         counts = self.fits(self.sigma)
         more, confounded = self._significant(views, counts, square_pixels)
-        self.confounded = confounded and STRETCH[0] in more
         if {*more} == {*self.free.more}:
+            self.confounded = confounded and STRETCH[0] in more
             return self
-        lens, poses = self.state.lens, (self.state.rotations, self.state.translations)
-        free, state = _state(lens, more, poses, self.state.shape)
-        state, scale = refine(
-            views._replace(seen=views.seen & self.used[:, None]), free, state, stages=[FINE]
-        )
+        free, state = _state(self.state.lens, more, *self.state[2:])
+        state, scale = refine(views._replace(seen=self.counts), free, state, stages=[FINE])
         other = _Found(free, state, scale, views, self.used)
         for one in (self, other):
             one.judge(views, counts)
@@ -303,11 +265,9 @@ class _Found:
         extra = {name for group in open_ for name in group}
         free, confounded = Free(self.state.lens, (*held, *extra)), False
         vector = free.vector(self.state.shape)
-        used = counts.any(1)
-        miss, counts, slopes, _ = self._normal(views, counts, free)
-        place = views.of(used).group
+        place, miss, counts, slopes, _ = self._normal(views, counts, free)
         without = miss.new_zeros(int(place.max()) + 1, len(vector))
-        low, high = free.low, free.high
+        low, high, noise = free.low, free.high, max(self.sigma, SHARPEST) ** 2
         while open_:
             stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
             free.low, free.high = (torch.where(stay, vector, end) for end in (low, high))
@@ -315,15 +275,14 @@ class _Found:
             step = normal.steps()[0, : len(vector)]
             # By the noise, and by what changes where the pictures of a place are left out.
             apart = without.index_put((place,), normal.steps(place)[:, : len(vector)] - step)
-            covariance = (
-                max(self.sigma, SHARPEST) ** 2 * normal.covariance()[:-3, :-3] + apart.mT @ apart
-            )
+            covariance = noise * normal.covariance()[:-3, :-3] + apart.mT @ apart
             sure = {}
             for group in open_:
                 at = [free.names.index(name) for name in group]
                 value = (vector + step)[at] - float(group == PIXELS)  # a ratio of 1 is none
-                squared = value @ torch.linalg.solve(covariance[at][:, at], value)
-                sure[group] = squared.sqrt().item()
+                sure[group] = (
+                    (value @ torch.linalg.solve(covariance[at][:, at], value)).sqrt().item()
+                )
             chance = [group for group in open_ if not sure[group] > OFF]
             if not chance:
                 break
@@ -334,14 +293,14 @@ class _Found:
 
     def _normal(
         self, views: Views, counts: Tensor, free: Free
-    ) -> tuple[Tensor, Tensor, Tensor, Normal]:
-        """Misses, counts, slopes and equations of the pictures with corners that count, (P, K)."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Normal]:
+        """Places, misses, counts, slopes and equations of the pictures with corners that count."""
         used = counts.any(1)
         vector = self.state.vector if free is self.free else free.vector(self.state.shape)
         slopes = views.of(used).slopes(free, self.state.of(used)._replace(vector=vector))
         miss, counts = self.miss[used], counts[used]
         normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
-        return miss, counts, slopes, normal
+        return views.of(used).group, miss, counts, slopes, normal
 
 
 def _simplest(found: list[_Found]) -> _Found:
@@ -356,7 +315,7 @@ def _simplest(found: list[_Found]) -> _Found:
 
 
 def _state(
-    lens: Lens, more: Sequence[str], poses: tuple[Tensor, Tensor], shape: Tensor
+    lens: Lens, more: Sequence[str], rotations: Tensor, translations: Tensor, shape: Tensor
 ) -> tuple[Free, State]:
     """The free numbers of a lens, and the state with these poses and the board's shape, (3,)."""
     free = Free(lens, more)
@@ -364,7 +323,7 @@ def _state(
     whole = free.lens(vector)
     if whole is None:
         raise CalibrationError(f"No {free.model.__name__} lens is close to the start.")
-    return free, State(vector, whole, *poses, free.shape(vector))
+    return free, State(vector, whole, rotations, translations, free.shape(vector))
 
 
 def _find(
@@ -377,14 +336,12 @@ def _find(
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
     poses = radial.poses(rays, views.seen.to(rays), board)
-    free, state = _state(start.lens(model, terms, top, size), more, poses, views.board.new_zeros(3))
+    free, state = _state(start.lens(model, terms, top, size), more, *poses, poses[1].new_zeros(3))
     agreeing = views._replace(seen=views.seen & used[:, None])
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
     if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
-        free, state = _state(
-            state.lens.replace(**zeros), more, (state.rotations, state.translations), state.shape
-        )
+        free, state = _state(state.lens.replace(**zeros), more, *state[2:])
         state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
     if found.sigma > HOPELESS * max(usual, SHARPEST):

@@ -110,7 +110,7 @@ def test_grids_may_begin_with_another_tag():
     assert shown_instead(picture, other) == said
     near = Board.april_grid(2, 2, 60.0, 18.0, first_tag=29)
     assert shown_instead(picture, near).endswith("the board has 29 to 32: is its first tag 30?")
-    assert "`first_tag` 29 to 32, with a `gap` of 18" in near.question
+    assert "from `first_tag` 29 to 32, `gap` 18" in near.question
 
 
 def test_corners_between_slanted_squares_are_where_edges_cross_or_not_found():
