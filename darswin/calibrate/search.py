@@ -14,8 +14,22 @@ from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts, misshapen
 from darswin.calibrate.inputs import LEAST_PICTURES, CalibrationError, checked, usable_pictures
 from darswin.calibrate.refine import (
-    AGAIN, BEND, FINE, MEDIAN, OFF, PIXELS, ROUGH, SHARPEST, STRETCH, Free, Normal, State, Views,
-    losses, refine, weights_of,
+    AGAIN,
+    BEND,
+    FINE,
+    MEDIAN,
+    OFF,
+    PIXELS,
+    ROUGH,
+    SHARPEST,
+    STRETCH,
+    Free,
+    Normal,
+    State,
+    Views,
+    losses,
+    refine,
+    weights_of,
 )  # fmt: skip
 from darswin.calibrate.steady import FEW, Steadiness, growth, unsure
 from darswin.lens import MODELS, Lens
@@ -87,6 +101,16 @@ def calibrate(
     views = whole.of(usable)
     say(f"Finding a start from {len(views.seen)} pictures")
     start = radial.start(views.corners, views.seen, views.board[:, :2], size)
+
+    def with_more(one: _Found) -> _Found:
+        """The same with what is sure of pixels and board, if its lens is accepted."""
+        for _ in range(TIMES):
+            other = one.with_more(views, square_pixels)
+            if other is one or (accept and accept(one.state.lens) > accept(other.state.lens)):
+                break
+            one = other
+        return one
+
     found: list[_Found] = []
     failed: list[tuple[str, float, float, str]] = []
     for kind in kinds:
@@ -96,13 +120,7 @@ def calibrate(
         more = list(PIXELS) * (square_pixels is False)
         more = min(found, key=lambda one: one.sigma).free.more if found else more
         try:
-            one = _find(kind, terms, views, start, size, more, usual)
-            for _ in range(TIMES * (one.sigma <= HOPELESS * max(usual, SHARPEST))):
-                other = one.with_more(views, square_pixels)
-                if other is one or (accept and accept(one.state.lens) > accept(other.state.lens)):
-                    break
-                one = other
-            found.append(one)
+            found.append(_find(kind, terms, views, start, size, more, usual, with_more))
         except CalibrationError as error:
             failed.append((kind.__name__, math.nan, math.nan, str(error)))
         except torch.linalg.LinAlgError:
@@ -242,8 +260,7 @@ class _Found:
     def with_more(self, views: Views, square_pixels: bool | None) -> "_Found":
         """The same with those of PIXELS, BEND and STRETCH that are significant, and without others,
         as far as that predicts left-out pictures better, to first order."""
-        counts = self.fits(self.sigma)
-        more, confounded = self._significant(views, counts, square_pixels)
+        more, confounded = self._significant(views, square_pixels)
         if {*more} == {*self.free.more}:
             self.confounded = confounded and STRETCH[0] in more
             return self
@@ -251,12 +268,10 @@ class _Found:
         state, scale = refine(views._replace(seen=self.counts), free, state, stages=[FINE])
         other = _Found(free, state, scale, views, self.used)
         for one in (self, other):
-            one.judge(views, counts)
+            one.judge(views, self.fits(self.sigma))
         return _simplest([self, other])
 
-    def _significant(
-        self, views: Views, counts: Tensor, square_pixels: bool | None
-    ) -> tuple[list[str], bool]:
+    def _significant(self, views: Views, square_pixels: bool | None) -> tuple[list[str], bool]:
         """The names of the numbers of the pixels and of the board's shape that are no chance, to
         first order; and whether boards that never turn in the picture cannot tell its stretch from
         that of the pixels."""
@@ -265,7 +280,7 @@ class _Found:
         extra = {name for group in open_ for name in group}
         free, confounded = Free(self.state.lens, (*held, *extra)), False
         vector = free.vector(self.state.shape)
-        place, miss, counts, slopes, _ = self._normal(views, counts, free)
+        place, miss, counts, slopes, _ = self._normal(views, self.fits(self.sigma), free)
         without = miss.new_zeros(int(place.max()) + 1, len(vector))
         low, high, noise = free.low, free.high, max(self.sigma, SHARPEST) ** 2
         while open_:
@@ -328,7 +343,7 @@ def _state(
 
 def _find(
     model: type[Lens], terms: int | None, views: Views, start: radial.Start,
-    size: tuple[int, int], more: Sequence[str], usual: float,
+    size: tuple[int, int], more: Sequence[str], usual: float, with_more: Callable[[_Found], _Found],
 ) -> _Found:  # fmt: skip
     """The lens of a model and the poses, from all pictures that agree. It stays rough where corners
     are much farther off than the `usual` standard deviation, px."""
@@ -339,9 +354,12 @@ def _find(
     free, state = _state(start.lens(model, terms, top, size), more, *poses, poses[1].new_zeros(3))
     agreeing = views._replace(seen=views.seen & used[:, None])
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
-    if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
+    # Far from the best lens, these terms could cut off the rim, and they imitate oblong pixels.
+    if model.__name__ in ASIDE:
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
-        free, state = _state(state.lens.replace(**zeros), more, *state[2:])
+        plain = with_more(_Found(free, state, scale, views, used))
+        lens = plain.state.lens.replace(**zeros)
+        free, state = _state(lens, plain.free.more, *plain.state[2:])
         state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
     if found.sigma > HOPELESS * max(usual, SHARPEST):
@@ -370,4 +388,4 @@ def _find(
             )
         if torch.equal(before, used) and not better[used].any():
             break
-    return _Found(free, state, scale, views, used)
+    return with_more(_Found(free, state, scale, views, used))
