@@ -29,6 +29,7 @@ ROUGH, FINE, AGAIN = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5), (0.5, MEDIAN, 1e-3
 # More than a model has: the ratio of a pixel's sides; and the shape of a board, by which its points
 # (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
 PIXELS, BEND, STRETCH = ("affine[3]",), ("bend[0]", "bend[1]"), ("stretch",)
+FLAT = torch.zeros(3, dtype=torch.float64)
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
 HELD: dict[tuple[type[Lens], str], Any] = {
     (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
@@ -40,10 +41,11 @@ class Free:
     """The free numbers of a lens and of the board as a vector (n,), and the lens of a vector.
 
     Free are the parameters of the model, the principal point, and those of PIXELS, BEND and STRETCH
-    that `more` names. OCam's linear term stays 0, and a table's angles stay as they are.
+    that `more` names, from a `shape` (3,) of the board on. OCam's linear term stays 0, and a
+    table's angles stay as they are.
     """
 
-    def __init__(self, lens: Lens, more: Sequence[str] = ()):
+    def __init__(self, lens: Lens, more: Sequence[str] = (), shape: Tensor = FLAT):
         tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
         tensors["center"] = lens.center
         held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
@@ -67,12 +69,13 @@ class Free:
         self.start, self._rest = vector[free], torch.where(free, 0, vector)
         self._places = torch.eye(len(vector)).to(vector)[:, free]
         # The lens has no part in the numbers of the board, which come last.
-        shape = [name for name in (*BEND, *STRETCH) if name in more]
-        self.names, self.more = self.names + shape, [*more]
-        self.shaped = torch.tensor([name in shape for name in (*BEND, *STRETCH)])
-        self.start, self._places = (F.pad(x, (0, len(shape))) for x in (self.start, self._places))
+        own = [name for name in (*BEND, *STRETCH) if name in more]
+        self.names, self.more = self.names + own, [*more]
+        self.shaped = torch.tensor([name in own for name in (*BEND, *STRETCH)])
+        self.start = torch.cat((self.start, shape[self.shaped]))
+        self._places = F.pad(self._places, (0, len(own)))
         self.low, self.high = (
-            F.pad(x, (0, len(shape)), value=end)
+            F.pad(x, (0, len(own)), value=end)
             for x, end in ((self.low, -math.inf), (self.high, math.inf))
         )
 
@@ -102,11 +105,6 @@ class Free:
         count = int(self.shaped.sum())
         return vector.new_zeros(3).masked_scatter(self.shaped, vector[len(vector) - count :])
 
-    def vector(self, shape: Tensor) -> Tensor:
-        """(n,): the numbers of the lens, with the shape of the board, (3,)."""
-        own = shape[self.shaped]
-        return torch.cat((self.start[: len(self.start) - len(own)], own))
-
     def held(self, vector: Tensor, side: Tensor) -> Tensor:
         """(n,) bool: the numbers that are at a bound and would leave it in the direction `side`."""
         return ((vector <= self.low) & (side <= 0)) | ((vector >= self.high) & (side >= 0))
@@ -128,7 +126,7 @@ class State(NamedTuple):
     lens: Lens
     rotations: Tensor
     translations: Tensor
-    shape: Tensor = torch.zeros(3, dtype=torch.float64)
+    shape: Tensor = FLAT
 
     def of(self, which: Tensor) -> "State":
         """The state of some pictures."""

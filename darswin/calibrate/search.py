@@ -17,6 +17,7 @@ from darswin.calibrate.refine import (
     AGAIN,
     BEND,
     FINE,
+    FLAT,
     MEDIAN,
     OFF,
     PIXELS,
@@ -278,8 +279,8 @@ class _Found:
         held = list(PIXELS) * (square_pixels is False)
         open_ = [*[PIXELS] * (square_pixels is None), BEND, STRETCH]
         extra = {name for group in open_ for name in group}
-        free, confounded = Free(self.state.lens, (*held, *extra)), False
-        vector = free.vector(self.state.shape)
+        free, confounded = Free(self.state.lens, (*held, *extra), self.state.shape), False
+        vector = free.start
         place, miss, counts, slopes, _ = self._normal(views, self.fits(self.sigma), free)
         without = miss.new_zeros(int(place.max()) + 1, len(vector))
         low, high, noise = free.low, free.high, max(self.sigma, SHARPEST) ** 2
@@ -311,7 +312,7 @@ class _Found:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Normal]:
         """Places, misses, counts, slopes and equations of the pictures with corners that count."""
         used = counts.any(1)
-        vector = self.state.vector if free is self.free else free.vector(self.state.shape)
+        vector = self.state.vector if free is self.free else free.start
         slopes = views.of(used).slopes(free, self.state.of(used)._replace(vector=vector))
         miss, counts = self.miss[used], counts[used]
         normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
@@ -333,12 +334,11 @@ def _state(
     lens: Lens, more: Sequence[str], rotations: Tensor, translations: Tensor, shape: Tensor
 ) -> tuple[Free, State]:
     """The free numbers of a lens, and the state with these poses and the board's shape, (3,)."""
-    free = Free(lens, more)
-    vector = free.vector(shape)
-    whole = free.lens(vector)
+    free = Free(lens, more, shape)
+    whole = free.lens(free.start)
     if whole is None:
         raise CalibrationError(f"No {free.model.__name__} lens is close to the start.")
-    return free, State(vector, whole, rotations, translations, free.shape(vector))
+    return free, State(free.start, whole, rotations, translations, free.shape(free.start))
 
 
 def _find(
@@ -351,7 +351,7 @@ def _find(
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
     poses = radial.poses(rays, views.seen.to(rays), board)
-    free, state = _state(start.lens(model, terms, top, size), more, *poses, poses[1].new_zeros(3))
+    free, state = _state(start.lens(model, terms, top, size), more, *poses, FLAT)
     agreeing = views._replace(seen=views.seen & used[:, None])
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
     # Far from the best lens, these terms could cut off the rim, and they imitate oblong pixels.

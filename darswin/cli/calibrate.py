@@ -112,8 +112,7 @@ def calibrate(
                 progress=lambda step: setattr(progress, "step", step),
             )  # fmt: skip
         except CalibrationError as error:
-            said = [str(error), *seen.doubts, *seen.broken.errors]
-            raise ValueError("\n".join(said)) from error
+            raise ValueError("\n".join([str(error), *seen.doubts, *seen.broken.errors])) from error
     lens = _within(seen.brightest, found.lens, theta_max_deg)
     # Its reach is compared with the image circle, not with the picture's sides.
     before, after = (out_of_reach(found.supported, one) for one in (found.lens, lens))

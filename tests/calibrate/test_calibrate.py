@@ -197,8 +197,7 @@ def test_many_models_find_a_lens_that_one_cannot_show(model, seed, best):
 @pytest.mark.parametrize(("model", "ratio", "words"), slow_but(
     [(model, *row) for model in ("KannalaBrandt", "Mei", "Perspective", "Fisheye624", "auto")
      for row in ((1.05, "5 % longer"), (0.99, "1 % shorter"), (1.0, None))],
-    ("KannalaBrandt", 0.99, "1 % shorter"), ("Perspective", 1.05, "5 % longer"),
-    ("Fisheye624", 1.05, "5 % longer"),
+    ("Fisheye624", 0.99, "1 % shorter"), ("Perspective", 1.05, "5 % longer"),
 ))  # fmt: skip
 def test_the_ratio_of_a_pixels_sides_is_found_if_it_is_significant(model, ratio, words):
     lens = {"auto": "KannalaBrandt"}.get(model, model)
