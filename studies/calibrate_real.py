@@ -2,7 +2,8 @@
 
 Five fits leave out a fifth of the pictures each. Then only the poses of the boards in the pictures
 that were left out are fitted, and the distances of their corners are measured. The pictures are
-those of Debian's package `opencv-doc`, and of public repositories that are cloned into a folder.
+those of Debian's package `opencv-doc`, and of public repositories that are cloned into a folder;
+one repository has the corners of its pictures only.
 """
 
 from pathlib import Path
@@ -24,7 +25,8 @@ SQUARE = 0.03  # the unit does not matter
 
 
 class Boards(NamedTuple):
-    """Pictures of a chessboard with columns × rows inner corners; the pattern of their names."""
+    """Pictures of a chessboard with columns × rows inner corners: the pattern of their names, or
+    the file in which OpenCV has written their corners."""
 
     pictures: str
     columns: int
@@ -39,6 +41,16 @@ SETS = {
     "stereo, left": Boards("fisheye-stereo-calibration/imgs/left*.jpg", 9, 6),
     "stereo, right": Boards("fisheye-stereo-calibration/imgs/right*.jpg", 9, 6),
     "camodocal, front": Boards("camodocal/data/images/*.bmp", 9, 6),
+    "NXP, curled sheet": Boards(
+        "surround-view-imx/App/Content/camera_models/chessboard_1/*.jpg", 7, 5
+    ),
+    "copark": Boards("fisheye_calib/img*.png", 8, 6),
+    "T265, on paper": Boards("underwater-fisheye-calibration/fisheye_imgs/*.png", 7, 5),
+    "T265, in air": Boards("underwater-fisheye-calibration/air_fisheye_right_imgs/*.png", 7, 5),
+    "glass": Boards("fisheye_calibration/data/glass1/img*0.png", 8, 6),
+    "omnidir's tutorial": Boards(
+        "opencv_contrib/modules/ccalib/tutorials/data/omni_calib_data.xml", 6, 9
+    ),
 }
 
 
@@ -52,11 +64,8 @@ def real_set(name: str, files: list[Path], tools: dict[str, str]) -> dict:
     """The errors of the methods whose tools are there, on pictures that were left out."""
     _, columns, rows = SETS[name]
     board = Board.chessboard(columns, rows, SQUARE)
-    # Some sets have a picture twice.
-    read = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
-    pictures = [*{picture.tobytes(): picture for picture in read if picture is not None}.values()]
-    (size,) = {picture.shape for picture in pictures}
-    corners = np.stack([find_corners(picture, board) for picture in pictures])
+    corners, size = _corners(files, board)
+    count = len(corners)
     corners = corners[np.isfinite(corners).all((1, 2))]
     whole = calibrate(corners, board, size, "KannalaBrandt")
     distance = whole.residuals.norm(dim=-1).numpy()
@@ -68,9 +77,24 @@ def real_set(name: str, files: list[Path], tools: dict[str, str]) -> dict:
         if NEEDS.get(method, "opencv") in tools
     }
     return dict(
-        set=name, of=len(pictures), pictures=len(corners), corners=corners[..., 0].size,
+        set=name, of=count, pictures=len(corners), corners=corners[..., 0].size,
         wrong=int(wrong.sum()), results=results,
     )  # fmt: skip
+
+
+def _corners(files: list[Path], board: Board) -> tuple[np.ndarray, tuple[int, int]]:
+    """The corners (P, K, 2) px, NaN where not found, and the size (H, W)."""
+    if files[0].suffix == ".xml":
+        stored = cv2.FileStorage(str(files[0]), cv2.FILE_STORAGE_READ)
+        points, sides = stored.getNode("imagePoints"), stored.getNode("imageSize")
+        width, height = (int(sides.at(k).real()) for k in (0, 1))
+        places = [points.at(k).mat().reshape(-1, 2) for k in range(points.size())]
+        return np.array(places, np.float64), (height, width)
+    # Some sets have a picture twice.
+    read = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
+    pictures = [*{picture.tobytes(): picture for picture in read if picture is not None}.values()]
+    (size,) = {picture.shape for picture in pictures}
+    return np.stack([find_corners(picture, board) for picture in pictures]), size
 
 
 def left_out(

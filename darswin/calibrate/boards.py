@@ -18,6 +18,7 @@ LEAST_SIDE = 16  # px: smaller pictures show nothing
 SIDE = 1200  # px, to which larger pictures are reduced at first
 RING = 1.5  # px: smaller ones around a corner show nothing
 UNLIKE = 0.3  # of the range of light; right corners have 0.15 at most
+QUESTION = "Are the board and the order of its corners right?"
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
@@ -86,6 +87,12 @@ class Board:
         return range(self.first_tag, self.first_tag + count)
 
     @property
+    def question(self) -> str:
+        """What to ask where its corners do not fit."""
+        tags = f"from `first_tag` {self.first_tag} to {self.markers[-1]}, `gap` {self.other:g}"
+        return QUESTION + f" Its AprilTags are taken to run {tags}." * (self.kind == "april")
+
+    @property
     def reach(self) -> float:
         """The distance around a corner without edges of other corners."""
         if self.kind == "chessboard":
@@ -147,9 +154,11 @@ def shown_instead(picture: np.ndarray, board: Board) -> str:
     said = f"markers {seen[0]} to {seen[-1]} of {name}"
     if name != board.dictionary:
         return said
-    if seen[len(seen) // 2] not in board.markers:
+    outside = sum(number not in board.markers for number in seen)
+    if outside > (0 if board.kind == "april" else len(seen) / 2):
+        said += f", but the board has {board.markers[0]} to {board.markers[-1]}"
         begins = board.kind == "april" and seen[-1] - seen[0] < len(board.markers)
-        return said + f", but the first tag of the board is {board.first_tag}" * begins
+        return said + f": is its first tag {seen[0]}?" * begins
     why = "the markers are too small or cut off, or columns and rows are swapped"
     if board.kind == "april":
         why = "columns and rows are swapped, or the gap is a ratio in place of a length"

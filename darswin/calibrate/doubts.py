@@ -7,7 +7,7 @@ from torch import Tensor
 
 from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.inputs import LEAST_CORNERS, CalibrationError
-from darswin.calibrate.refine import MEDIAN, OFF, SHARPEST
+from darswin.calibrate.refine import OFF, SHARPEST
 from darswin.calibrate.steady import FEW, Steadiness
 from darswin.lens import Lens
 
@@ -35,11 +35,6 @@ def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadine
     said, used = list[str](), found.used
     rotations = found.rotations[used]
     middles = rotations @ middle + found.translations[used]
-    if found.sigma > WRONG * found.lens.image_size.mean():
-        raise CalibrationError(
-            f"Half of the corners are {MEDIAN * found.sigma:.3g} px or more off the best lens: are "
-            "the board and the order of its corners right?"
-        )
     noise = math.degrees(steady.noise) * max(1.0, SHARPEST / max(found.sigma, 1e-12))
     scatter = math.degrees(steady.scatter)
     unsure, disagree = max(noise, scatter), scatter > DISAGREE * noise

@@ -52,11 +52,14 @@ class Start(NamedTuple):
         end = model._end if issubclass(model, FocalLens) else math.pi
         if top > end + 0.05:
             raise CalibrationError(
-                f"The corners reach {math.degrees(top):.0f}° from the axis, but a {model.__name__} "
-                f"lens ends at {math.degrees(end):.0f}°: choose another model."
+                f"The corners reach {math.degrees(top):.0f}° from the axis, but {model.__name__} "
+                f"lenses end at {math.degrees(end):.0f}°: choose another model."
             )
         image = {"center": self.center[None], "image_size": self.center.new_tensor([size])}
-        curve = OCam(-self.depth[None], **image)
+        try:
+            curve = OCam(-self.depth[None], **image)
+        except ValueError:
+            raise CalibrationError("No lens is close to the corners.") from None
         limit = curve.theta_limit.item()
         if issubclass(model, Tabulated):
             last = min(1.03 * top + 0.02, limit)

@@ -26,8 +26,10 @@ MEDIAN, MOST = (math.sqrt(-2 * math.log(1 - part)) for part in (0.5, 0.97))
 # distance in standard deviations; the smallest gain of a round. ROUGH follows the worst corners.
 # AGAIN starts where FINE has ended, with a part of the pictures.
 ROUGH, FINE, AGAIN = (0.97, MOST, 1e-3), (0.5, MEDIAN, 1e-5), (0.5, MEDIAN, 1e-3)
-# The shape of a board, by which its points (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
-BEND, STRETCH = ("bend[0]", "bend[1]"), ("stretch",)
+# More than a model has: the ratio of a pixel's sides; and the shape of a board, by which its points
+# (x, y, 0) become (x, (1 + stretch) y, bends · (x², y²)).
+PIXELS, BEND, STRETCH = ("affine[3]",), ("bend[0]", "bend[1]"), ("stretch",)
+FLAT = torch.zeros(3, dtype=torch.float64)
 # The places of numbers that stay as they are; of an affine, all but the ratio of a pixel's sides.
 HELD: dict[tuple[type[Lens], str], Any] = {
     (OCam, "coefficients"): [1], (OCamInverse, "coefficients"): [0],
@@ -38,19 +40,19 @@ HELD: dict[tuple[type[Lens], str], Any] = {
 class Free:
     """The free numbers of a lens and of the board as a vector (n,), and the lens of a vector.
 
-    Free are the parameters of the model and the principal point; unless pixels are square, the
-    ratio of their sides; and the numbers of the board's shape with the names `shape`. OCam's linear
-    term stays 0, and a table's angles stay as they are.
+    Free are the parameters of the model, the principal point, and those of PIXELS, BEND and STRETCH
+    that `more` names, from a `shape` (3,) of the board on. OCam's linear term stays 0, and a
+    table's angles stay as they are.
     """
 
-    def __init__(self, lens: Lens, square_pixels: bool, shape: Sequence[str] = ()):
+    def __init__(self, lens: Lens, more: Sequence[str] = (), shape: Tensor = FLAT):
         tensors = {n: v for n, v in lens._tensors().items() if n not in lens.common}
         tensors["center"] = lens.center
         held = {name: torch.zeros_like(value[0]).bool() for name, value in tensors.items()}
         for (model, name), places in HELD.items():
             if isinstance(lens, model):
                 held[name][places] = True
-        if not square_pixels:
+        if PIXELS[0] in more:
             tensors["affine"] = lens._affine()
             held["affine"] = torch.tensor([[True, True], [True, False]])
         free = ~torch.cat([value.flatten() for value in held.values()])
@@ -67,11 +69,13 @@ class Free:
         self.start, self._rest = vector[free], torch.where(free, 0, vector)
         self._places = torch.eye(len(vector)).to(vector)[:, free]
         # The lens has no part in the numbers of the board, which come last.
-        self.names += shape
-        self.shaped = torch.tensor([name in shape for name in (*BEND, *STRETCH)])
-        self.start, self._places = (F.pad(x, (0, len(shape))) for x in (self.start, self._places))
+        own = [name for name in (*BEND, *STRETCH) if name in more]
+        self.names, self.more = self.names + own, [*more]
+        self.shaped = torch.tensor([name in own for name in (*BEND, *STRETCH)])
+        self.start = torch.cat((self.start, shape[self.shaped]))
+        self._places = F.pad(self._places, (0, len(own)))
         self.low, self.high = (
-            F.pad(x, (0, len(shape)), value=end)
+            F.pad(x, (0, len(own)), value=end)
             for x, end in ((self.low, -math.inf), (self.high, math.inf))
         )
 
@@ -122,7 +126,7 @@ class State(NamedTuple):
     lens: Lens
     rotations: Tensor
     translations: Tensor
-    shape: Tensor = torch.zeros(3, dtype=torch.float64)
+    shape: Tensor = FLAT
 
     def of(self, which: Tensor) -> "State":
         """The state of some pictures."""

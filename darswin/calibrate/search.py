@@ -9,20 +9,18 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate import radial
+from darswin.calibrate.boards import QUESTION
 from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts, misshapen
-from darswin.calibrate.inputs import (
-    LEAST_PICTURES,
-    CalibrationError,
-    checked,
-    usable_pictures,
-)
+from darswin.calibrate.inputs import LEAST_PICTURES, CalibrationError, checked, usable_pictures
 from darswin.calibrate.refine import (
     AGAIN,
     BEND,
     FINE,
+    FLAT,
     MEDIAN,
     OFF,
+    PIXELS,
     ROUGH,
     SHARPEST,
     STRETCH,
@@ -33,7 +31,7 @@ from darswin.calibrate.refine import (
     losses,
     refine,
     weights_of,
-)
+)  # fmt: skip
 from darswin.calibrate.steady import FEW, Steadiness, growth, unsure
 from darswin.lens import MODELS, Lens
 from darswin.lens.base import unknown_model
@@ -50,8 +48,8 @@ ASIDE = {"BrownConrady": {"tangential": 2}, "Mei": {"tangential": 2},
          "Fisheye624": {"tangential": 2, "prism": 4}}  # fmt: skip
 FOLDS = 5  # parts of the pictures, of which each is left out once
 FINALISTS, CLOSE = 3, 1.25  # models that are fitted to parts; their left_out, by the best
-PIXELS = ("affine[3]",)  # the ratio of a pixel's sides
 HOPELESS = 4.0  # times the standard deviation of a corner from another model
+TIMES = 3  # that PIXELS, BEND and STRETCH are tried, as each changes what is sure of the others
 
 
 def calibrate(
@@ -99,24 +97,37 @@ def calibrate(
     kinds = [_kind(name) for name in (CANDIDATES if model == "auto" else [model])]
     if terms is not None:
         check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
+    question = getattr(board, "question", QUESTION)
     usable = usable_pictures(whole, size, names)
     views = whole.of(usable)
     say(f"Finding a start from {len(views.seen)} pictures")
     start = radial.start(views.corners, views.seen, views.board[:, :2], size)
+
+    def with_more(one: _Found) -> _Found:
+        """The same with what is sure of pixels and board, if its lens is accepted."""
+        for _ in range(TIMES):
+            other = one.with_more(views, square_pixels)
+            if other is one or (accept and accept(one.state.lens) > accept(other.state.lens)):
+                break
+            one = other
+        return one
+
     found: list[_Found] = []
     failed: list[tuple[str, float, float, str]] = []
     for kind in kinds:
         say(f"Refining the lens: {kind.__name__}")
+        usual = min([WRONG * max(size) / HOPELESS, *(one.sigma for one in found)])
+        # Terms of a model may imitate what is of the pixels or the board, so each starts with that.
+        more = list(PIXELS) * (square_pixels is False)
+        more = min(found, key=lambda one: one.sigma).free.more if found else more
         try:
-            usual = min([WRONG * max(size) / HOPELESS, *(one.sigma for one in found)])
-            found.append(_find(kind, terms, views, start, size, square_pixels is not False, usual))
-        except (CalibrationError, torch.linalg.LinAlgError) as error:
-            reason = (
-                error if isinstance(error, CalibrationError) else "Its equations have no solution."
-            )
-            failed.append((kind.__name__, math.nan, math.nan, str(reason)))
+            found.append(_find(kind, terms, views, start, size, more, usual, with_more))
+        except CalibrationError as error:
+            failed.append((kind.__name__, math.nan, math.nan, str(error)))
+        except torch.linalg.LinAlgError:
+            failed.append((kind.__name__, math.nan, math.nan, "Its equations have no solution."))
     if not found:
-        raise CalibrationError(failed[0][3])
+        raise naming(CalibrationError(f"{failed[0][3]} {question}"), "first_tag", "gap")
     # A corner that fits any model counts for all: no model may leave out the rim or pictures.
     most = max(one.used.sum() for one in found)
     sigma = min(one.sigma for one in found if one.used.sum() == most)
@@ -126,12 +137,9 @@ def calibrate(
     found.sort(key=lambda one: one.left_out)
     taken = [one for one in found if accept is None or accept(one.state.lens)] or found
     close = [one for one in taken if not one.left_out > CLOSE * taken[0].left_out][:FINALISTS]
-    for k, one in enumerate(close):
+    for one in close:
         say(f"Leaving out pictures: {one.free.model.__name__}")
-        other = one.with_more(views, counts, square_pixels)
-        if accept is None or not accept(one.state.lens) or accept(other.state.lens):
-            found[found.index(one)] = close[k] = other
-        close[k].leave_out(views, counts)
+        one.leave_out(views, counts)
     best = _simplest(close)
     found.sort(key=lambda one: (one is not best, one.left_out))
     table = [(one.free.model.__name__, one.left_out, one.error, "") for one in found] + failed
@@ -146,10 +154,13 @@ def calibrate(
 
     lens, seen = best.state.lens, views.seen
     supported = theta[best.fits(best.sigma)].quantile(0.99).item()
+    if best.sigma > WRONG * sum(size) / 2:
+        off = f"{MEDIAN * best.sigma:.3g} px or more off the best lens. {question}"
+        raise naming(CalibrationError(f"Half of the corners are {off}"), "first_tag", "gap")
     steady = best.steadiness(views, counts, supported)
     lens = lens.with_theta_max(reach(lens))
     result = CalibratedLens(
-        lens=lens,
+        lens=lens, names=names, parameters=best.free.names, covariance=best.joint[:-3, :-3],
         rotations=all_pictures(best.state.rotations),
         translations=all_pictures(unit * best.state.translations - best.state.rotations @ spot),
         board=unit * views.shaped(best.state.shape) + spot,
@@ -158,20 +169,11 @@ def calibrate(
         weights=all_pictures(weights_of(miss, best.scale) * (seen & best.used[:, None]), 0.0),
         theta=all_pictures(torch.where(seen, theta, torch.nan)),
         used=all_pictures(best.used, False),
-        names=names,
-        sigma=best.sigma,
-        error=best.error,
-        left_out=best.left_out,
-        supported=supported,
-        unsure=max(steady.noise, steady.scatter),
-        parameters=best.free.names,
-        covariance=best.joint[:-3, :-3],
-        models=table if model == "auto" else [],
-        doubts=[],
-        _free=best.free,
-        _vector=best.state.vector,
-        _joint=best.joint,
-    )
+        sigma=best.sigma, error=best.error, left_out=best.left_out,
+        supported=supported, unsure=max(steady.noise, steady.scatter),
+        models=table if model == "auto" else [], doubts=[],
+        _free=best.free, _vector=best.state.vector, _joint=best.joint,
+    )  # fmt: skip
     result.doubts.extend(doubts(result, whole.seen, spot, steady))
     result.doubts.extend(misshapen(result, best.state.shape, best.confounded))
     return result
@@ -191,9 +193,9 @@ class _Found:
     """A lens of one model with the poses, and what is known of them."""
 
     error = left_out = math.nan
+    squares = torch.tensor([math.nan])  # the sum of the squared misses in each picture left out
     confounded = False  # the board's stretch may be that of the pixels
     joint: Tensor
-    squares: Tensor
 
     def __init__(self, free: Free, state: State, scale: float, views: Views, used: Tensor):
         self.free, self.state, self.scale, self.used = free, state, scale, used
@@ -208,21 +210,21 @@ class _Found:
         return self.counts & (self.distance <= OFF * max(sigma, SHARPEST))
 
     def judge(self, views: Views, counts: Tensor) -> None:
-        """Computes the covariance and the errors, over the corners that count, (P, K)."""
-        place = views.of(counts.any(1)).group
-        miss, counts, slopes, normal = self._normal(views, counts, self.free)
+        """Computes the covariance and the errors, over the corners that count, (P, K): to first
+        order, `squares` and `left_out` are of a lens without the pictures of each place."""
+        place, miss, counts, slopes, normal = self._normal(views, counts, self.free)
         self.joint = self.sigma**2 * normal.covariance()
         self.error = miss[counts].square().sum(-1).mean().sqrt().item()
         if place.max() >= LEAST_PICTURES:
             steps = normal.steps(place)
             moved = miss + (slopes @ steps[:, None, :, None])[..., 0]
-            self.left_out = moved[counts].square().sum(-1).mean().sqrt().item()
+            self.squares = (counts * moved.square().sum(-1)).sum(1)
+            self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
 
     def steadiness(self, views: Views, counts: Tensor, top: float) -> Steadiness:
         """Whether the pictures agree, over the corners that count, (P, K), up to an angle, rad."""
         mine, n = views.of(counts.any(1)), len(self.state.vector)
-        place = mine.group
-        miss, counts, slopes, normal = self._normal(views, counts, self.free)
+        place, miss, counts, slopes, normal = self._normal(views, counts, self.free)
         without = miss.new_zeros(int(place.max()) + 1, n)
         if len(without) >= FEW:
             without[place] = normal.steps(place)[:, :n]
@@ -232,9 +234,8 @@ class _Found:
         return Steadiness(len(without), *spread, *grown)
 
     def leave_out(self, views: Views, counts: Tensor) -> None:
-        """Computes `squares` (P,), the sums of the squared misses in each picture of a lens that
-        was found without it, and their mean; by fits to parts of the pictures. NaN for too few."""
-        pictures, seen = counts.any(1).nonzero()[:, 0], views.seen & self.used[:, None]
+        """The same by fits to parts of the pictures; NaN for too few."""
+        pictures = counts.any(1).nonzero()[:, 0]
         self.squares = counts.new_zeros(len(counts), dtype=torch.float64)
         place = views.of(pictures).group
         # The order of the pictures does not change the parts.
@@ -247,12 +248,8 @@ class _Found:
             if len(rest) < LEAST_PICTURES:
                 continue
             with contextlib.suppress(torch.linalg.LinAlgError):
-                without, _ = refine(
-                    views._replace(seen=seen).of(rest),
-                    self.free,
-                    self.state.of(rest),
-                    stages=[AGAIN],
-                )
+                mine = views._replace(seen=self.counts).of(rest)
+                without, _ = refine(mine, self.free, self.state.of(rest), stages=[AGAIN])
                 poses = self.state.of(part)
                 state = without._replace(rotations=poses.rotations, translations=poses.translations)
                 mine = views.of(part)
@@ -261,62 +258,65 @@ class _Found:
                 self.squares[part] = torch.where(counts[part], miss, 0.0).sum(1)
         self.left_out = (self.squares.sum() / counts.sum()).sqrt().item()
 
-    def with_more(self, views: Views, counts: Tensor, square_pixels: bool | None) -> "_Found":
-        """The same with the ratio of a pixel's sides and the shape of the board, as far as they
-        are significant, if they predict left-out pictures better, to first order."""
-        names, confounded = self._significant(views, counts, square_pixels is None)
-        if not names:
+    def with_more(self, views: Views, square_pixels: bool | None) -> "_Found":
+        """The same with those of PIXELS, BEND and STRETCH that are significant, and without others,
+        as far as that predicts left-out pictures better, to first order."""
+        more, confounded = self._significant(views, square_pixels)
+        if {*more} == {*self.free.more}:
+            self.confounded = confounded and STRETCH[0] in more
             return self
-        square = square_pixels is not False and PIXELS[0] not in names
-        free = Free(self.state.lens, square, [name for name in names if name not in PIXELS])
-        state = State(free.start, *self.state[1:])
-        state, scale = refine(
-            views._replace(seen=views.seen & self.used[:, None]), free, state, stages=[FINE]
-        )
+        free, state = _state(self.state.lens, more, *self.state[2:])
+        state, scale = refine(views._replace(seen=self.counts), free, state, stages=[FINE])
         other = _Found(free, state, scale, views, self.used)
-        other.judge(views, counts)
-        other.confounded = confounded and STRETCH[0] in names
-        return other if other.left_out < self.left_out else self
+        for one in (self, other):
+            one.judge(views, self.fits(self.sigma))
+        return _simplest([self, other])
 
-    def _significant(self, views: Views, counts: Tensor, pixels: bool) -> tuple[list[str], bool]:
-        """The names of the ratio of a pixel's sides, if it may change, and of the numbers of the
-        board's shape that are no chance, to first order; and whether boards that never turn in the
-        picture cannot tell its stretch from that of the pixels."""
-        open_ = [*[PIXELS] * pixels, BEND, STRETCH]
+    def _significant(self, views: Views, square_pixels: bool | None) -> tuple[list[str], bool]:
+        """The names of the numbers of the pixels and of the board's shape that are no chance, to
+        first order; and whether boards that never turn in the picture cannot tell its stretch from
+        that of the pixels."""
+        held = list(PIXELS) * (square_pixels is False)
+        open_ = [*[PIXELS] * (square_pixels is None), BEND, STRETCH]
         extra = {name for group in open_ for name in group}
-        square = not pixels and PIXELS[0] not in self.free.names
-        free, confounded = Free(self.state.lens, square, (*BEND, *STRETCH)), False
-        miss, counts, slopes, _ = self._normal(views, counts, free)
-        low, high = free.low, free.high
+        free, confounded = Free(self.state.lens, (*held, *extra), self.state.shape), False
+        vector = free.start
+        place, miss, counts, slopes, _ = self._normal(views, self.fits(self.sigma), free)
+        without = miss.new_zeros(int(place.max()) + 1, len(vector))
+        low, high, noise = free.low, free.high, max(self.sigma, SHARPEST) ** 2
         while open_:
             stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
-            free.low, free.high = (torch.where(stay, free.start, end) for end in (low, high))
-            normal = Normal(slopes, miss, counts.to(miss), free, free.start).damped(0.0)
-            step, covariance = normal.steps()[0], normal.covariance()
+            free.low, free.high = (torch.where(stay, vector, end) for end in (low, high))
+            normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
+            step = normal.steps()[0, : len(vector)]
+            # By the noise, and by what changes where the pictures of a place are left out.
+            apart = without.index_put((place,), normal.steps(place)[:, : len(vector)] - step)
+            covariance = noise * normal.covariance()[:-3, :-3] + apart.mT @ apart
             sure = {}
             for group in open_:
                 at = [free.names.index(name) for name in group]
-                value = step[at]
-                squared = value @ torch.linalg.solve(covariance[at][:, at], value)
-                sure[group] = squared.sqrt().item() / max(self.sigma, SHARPEST)
+                value = (vector + step)[at] - float(group == PIXELS)  # a ratio of 1 is none
+                sure[group] = (
+                    (value @ torch.linalg.solve(covariance[at][:, at], value)).sqrt().item()
+                )
             chance = [group for group in open_ if not sure[group] > OFF]
             if not chance:
                 break
             both = PIXELS in chance and STRETCH in chance
             confounded |= both
             open_.remove(PIXELS if both else min(chance, key=lambda group: sure[group]))
-        return [name for group in open_ for name in group], confounded
+        return [*held, *(name for group in open_ for name in group)], confounded
 
     def _normal(
         self, views: Views, counts: Tensor, free: Free
-    ) -> tuple[Tensor, Tensor, Tensor, Normal]:
-        """Misses, counts, slopes and equations of the pictures with corners that count, (P, K)."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Normal]:
+        """Places, misses, counts, slopes and equations of the pictures with corners that count."""
         used = counts.any(1)
         vector = self.state.vector if free is self.free else free.start
         slopes = views.of(used).slopes(free, self.state.of(used)._replace(vector=vector))
         miss, counts = self.miss[used], counts[used]
         normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
-        return miss, counts, slopes, normal
+        return views.of(used).group, miss, counts, slopes, normal
 
 
 def _simplest(found: list[_Found]) -> _Found:
@@ -330,18 +330,20 @@ def _simplest(found: list[_Found]) -> _Found:
     return best
 
 
-def _state(lens: Lens, square_pixels: bool, poses: tuple[Tensor, Tensor]) -> tuple[Free, State]:
-    """The free numbers of a lens, and the state with these poses."""
-    free = Free(lens, square_pixels)
+def _state(
+    lens: Lens, more: Sequence[str], rotations: Tensor, translations: Tensor, shape: Tensor
+) -> tuple[Free, State]:
+    """The free numbers of a lens, and the state with these poses and the board's shape, (3,)."""
+    free = Free(lens, more, shape)
     whole = free.lens(free.start)
     if whole is None:
         raise CalibrationError(f"No {free.model.__name__} lens is close to the start.")
-    return free, State(free.start, whole, *poses)
+    return free, State(free.start, whole, rotations, translations, free.shape(free.start))
 
 
 def _find(
     model: type[Lens], terms: int | None, views: Views, start: radial.Start,
-    size: tuple[int, int], square_pixels: bool, usual: float,
+    size: tuple[int, int], more: Sequence[str], usual: float, with_more: Callable[[_Found], _Found],
 ) -> _Found:  # fmt: skip
     """The lens of a model and the poses, from all pictures that agree. It stays rough where corners
     are much farther off than the `usual` standard deviation, px."""
@@ -349,14 +351,15 @@ def _find(
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     top = theta[views.seen & used[:, None]].max().item()
     poses = radial.poses(rays, views.seen.to(rays), board)
-    free, state = _state(start.lens(model, terms, top, size), square_pixels, poses)
+    free, state = _state(start.lens(model, terms, top, size), more, *poses, FLAT)
     agreeing = views._replace(seen=views.seen & used[:, None])
     state, scale = refine(agreeing, free, state, stages=[ROUGH])
-    if model.__name__ in ASIDE:  # far from the best lens, these terms could cut off the rim
+    # Far from the best lens, these terms could cut off the rim, and they imitate oblong pixels.
+    if model.__name__ in ASIDE:
         zeros = {name: rays.new_zeros(1, n) for name, n in ASIDE[model.__name__].items()}
-        free, state = _state(
-            state.lens.replace(**zeros), square_pixels, (state.rotations, state.translations)
-        )
+        plain = with_more(_Found(free, state, scale, views, used))
+        lens = plain.state.lens.replace(**zeros)
+        free, state = _state(lens, plain.free.more, *plain.state[2:])
         state, scale = refine(agreeing, free, state, stages=[ROUGH])
     found = _Found(free, state, scale, views, used)
     if found.sigma > HOPELESS * max(usual, SHARPEST):
@@ -367,7 +370,7 @@ def _find(
         # Each pose anew from its rays: some may be mirrored, some pictures may fit after all.
         rays = state.lens.unproject_points(views.corners)
         there = (views.seen & ~rays.isnan().any(-1)).to(rays)
-        again = State(*state[:2], *radial.poses(rays.nan_to_num(), there, board))
+        again = State(*state[:2], *radial.poses(rays.nan_to_num(), there, board), state.shape)
         again, _ = refine(views, free, again, lens_moves=False)
         loss, other = (losses(views.miss(x), scale).sum(1) for x in (state, again))
         better = other < loss - 0.1
@@ -381,9 +384,8 @@ def _find(
         before, used = used, typical <= OFF * sigma
         if used.sum() < LEAST_PICTURES:
             raise CalibrationError(
-                f"Only {int(used.sum())} pictures agree on a {model.__name__} lens: are the board "
-                "and the order of its corners right?"
+                f"Only {int(used.sum())} pictures agree on one {model.__name__} lens."
             )
         if torch.equal(before, used) and not better[used].any():
             break
-    return _Found(free, state, scale, views, used)
+    return with_more(_Found(free, state, scale, views, used))

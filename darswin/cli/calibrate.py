@@ -71,6 +71,7 @@ def calibrate(
             the image circle, if the pictures have one, or else of the picture's sides.
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
+    from darswin.calibrate import CalibrationError
     from darswin.calibrate import calibrate as found_by
     from darswin.calibrate.doubts import out_of_reach
     from darswin.cli.pictures import files_at
@@ -104,11 +105,14 @@ def calibrate(
         why = "; ".join([f"{few}: {LEAST} are needed, and 10 to 20 are better", *seen.doubts])
         raise ValueError("\n".join([why, *seen.broken.errors]))
     with Progress("calibrate") as progress:
-        found = found_by(
-            seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
-            square_pixels=square_pixels, accept=lambda lens: is_held(lens, out, format),
-            progress=lambda step: setattr(progress, "step", step),
-        )  # fmt: skip
+        try:
+            found = found_by(
+                seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
+                square_pixels=square_pixels, accept=lambda lens: is_held(lens, out, format),
+                progress=lambda step: setattr(progress, "step", step),
+            )  # fmt: skip
+        except CalibrationError as error:
+            raise ValueError("\n".join([str(error), *seen.doubts, *seen.broken.errors])) from error
     lens = _within(seen.brightest, found.lens, theta_max_deg)
     # Its reach is compared with the image circle, not with the picture's sides.
     before, after = (out_of_reach(found.supported, one) for one in (found.lens, lens))

@@ -104,10 +104,12 @@ def test_grids_may_begin_with_another_tag():
     board = Board.april_grid(2, 2, 60.0, 18.0, first_tag=30)
     assert [*board.markers] == [*range(30, 34)]
     np.testing.assert_allclose(find_corners(picture, board), board.points + 29.5, atol=1.0)
-    other = Board.april_grid(2, 2, 60.0, 18.0)
-    assert np.isnan(find_corners(picture, other)).all()
-    said = "markers 30 to 33 of APRILTAG_36h11, but the first tag of the board is 0"
-    assert shown_instead(picture, other) == said
+    for first in (0, 29):
+        other = Board.april_grid(2, 2, 60.0, 18.0, first_tag=first)
+        assert np.isnan(find_corners(picture, other)).all()
+        said = f"but the board has {first} to {first + 3}: is its first tag 30?"
+        assert shown_instead(picture, other) == f"markers 30 to 33 of APRILTAG_36h11, {said}"
+        assert f"from `first_tag` {first} to {first + 3}, `gap` 18" in other.question
 
 
 def test_corners_between_slanted_squares_are_where_edges_cross_or_not_found():
