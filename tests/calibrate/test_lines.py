@@ -35,12 +35,13 @@ LENSES = {
 
 
 def curves_of(
-    lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, first=0, center=(0.0, 0.0)
-):
-    """Curves of a camera in a world of lines along `axes` orthogonal directions, with lines askew
-    and curves that are not straight."""
+    lens, seed, straight=30, *, noise=0.15, askew=6, bent=6, axes=3, first=0, center=(0.0, 0.0),
+    rotation=None,
+):  # fmt: skip
+    """Curves of a camera in a world of lines along `axes` orthogonal directions, the rows of
+    `rotation`, with lines askew and curves that are not straight."""
     rng = np.random.default_rng(seed)
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if rotation is None else rotation
     curves = []
     while len(curves) < straight + askew + bent:
         k = len(curves)
@@ -181,6 +182,18 @@ def test_an_interval_holds_the_truth_also_if_pixels_are_oblong():
         low, high = from_curves([curves], SIZE).interval
         misses.append(abs(2 * rim_of(lens, 240 / ratio**0.5) - low - high) / (high - low))
     assert sum(miss <= 1 for miss in misses) >= 8 and max(misses) < 2
+
+
+@pytest.mark.parametrize("pitch", [0.5, pytest.param(0.9, marks=slow)])
+def test_a_pair_that_is_orthogonal_at_every_scale_sets_none(pitch):
+    """The marks on a floor below a camera: across it, and ahead of it."""
+    marks = np.array([[1, 0, 0], [0, -math.sin(pitch), math.cos(pitch)]])
+    curves = curves_of(LENSES["equisolid"], 1, 40, askew=0, axes=2, rotation=marks)
+    found = from_curves([curves], SIZE, "KannalaBrandt")
+    assert not found.is_sure and "do not set the scale" in found.doubts[0]
+    assert "hardly set the scale" in found.verdict
+    low, high = found.interval
+    assert abs(2 * rim_of(LENSES["equisolid"]) - low - high) < 2 * (high - low)
 
 
 @pytest.mark.parametrize(("of_second", "askew", "doubt"), [
