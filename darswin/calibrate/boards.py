@@ -3,14 +3,15 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import cv2
 import numpy as np
 
+from darswin.calibrate.inputs import CalibrationError
 from darswin.utils.image import with_channels
 from darswin.utils.nearest import did_you_mean
-from darswin.utils.parameters import check
+from darswin.utils.parameters import check, naming
 
 Kind = Literal["chessboard", "charuco", "april"]
 
@@ -18,7 +19,6 @@ LEAST_SIDE = 16  # px: smaller pictures show nothing
 SIDE = 1200  # px, to which larger pictures are reduced at first
 RING = 1.5  # px: smaller ones around a corner show nothing
 UNLIKE = 0.3  # of the range of light; right corners have 0.15 at most
-QUESTION = "Are the board and the order of its corners right?"
 MOST_CHANGE = 0.7  # of a step between corners to the next, in steps; a rim of 125° has 0.5
 
 
@@ -87,12 +87,6 @@ class Board:
         return range(self.first_tag, self.first_tag + count)
 
     @property
-    def question(self) -> str:
-        """What to ask where its corners do not fit."""
-        tags = f"from `first_tag` {self.first_tag} to {self.markers[-1]}, `gap` {self.other:g}"
-        return QUESTION + f" Its AprilTags are taken to run {tags}." * (self.kind == "april")
-
-    @property
     def reach(self) -> float:
         """The distance around a corner without edges of other corners."""
         if self.kind == "chessboard":
@@ -100,6 +94,15 @@ class Board:
         if self.kind == "charuco":
             return (self.square - self.other) / 2
         return min(self.square / (_dictionary(self.dictionary).markerSize + 2), self.other / 2)
+
+
+def misfit(board: Any, text: str) -> CalibrationError:
+    """The error of corners that do not fit a board or its points, with what to ask about it."""
+    text += " Are the board and the order of its corners right?"
+    if isinstance(board, Board) and board.kind == "april":
+        tags = f"from `first_tag` {board.first_tag} to {board.markers[-1]}, `gap` {board.other:g}"
+        text += f" Its AprilTags are taken to run {tags}."
+    return naming(CalibrationError(text), "first_tag", "gap")
 
 
 def find_corners(picture: np.ndarray, board: Board) -> np.ndarray:

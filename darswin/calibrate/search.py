@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from darswin.calibrate import radial
-from darswin.calibrate.boards import QUESTION
+from darswin.calibrate.boards import misfit
 from darswin.calibrate.calibrated import CalibratedLens
 from darswin.calibrate.doubts import WRONG, doubts, misshapen
 from darswin.calibrate.inputs import LEAST_PICTURES, CalibrationError, checked, usable_pictures
@@ -97,7 +97,6 @@ def calibrate(
     kinds = [_kind(name) for name in (CANDIDATES if model == "auto" else [model])]
     if terms is not None:
         check("terms", terms, isinstance(terms, int) and 1 <= terms <= 64, "1 to 64, or None")
-    question = getattr(board, "question", QUESTION)
     usable = usable_pictures(whole, size, names)
     views = whole.of(usable)
     say(f"Finding a start from {len(views.seen)} pictures")
@@ -127,7 +126,7 @@ def calibrate(
         except torch.linalg.LinAlgError:
             failed.append((kind.__name__, math.nan, math.nan, "Its equations have no solution."))
     if not found:
-        raise naming(CalibrationError(f"{failed[0][3]} {question}"), "first_tag", "gap")
+        raise misfit(board, failed[0][3])
     # A corner that fits any model counts for all: no model may leave out the rim or pictures.
     most = max(one.used.sum() for one in found)
     sigma = min(one.sigma for one in found if one.used.sum() == most)
@@ -155,8 +154,8 @@ def calibrate(
     lens, seen = best.state.lens, views.seen
     supported = theta[best.fits(best.sigma)].quantile(0.99).item()
     if best.sigma > WRONG * sum(size) / 2:
-        off = f"{MEDIAN * best.sigma:.3g} px or more off the best lens. {question}"
-        raise naming(CalibrationError(f"Half of the corners are {off}"), "first_tag", "gap")
+        off = f"{MEDIAN * best.sigma:.3g} px or more off the best lens."
+        raise misfit(board, f"Half of the corners are {off}")
     steady = best.steadiness(views, counts, supported)
     lens = lens.with_theta_max(reach(lens))
     result = CalibratedLens(

@@ -10,7 +10,7 @@ from calibrate_boards import Renderer
 from helpers import refused, slow_but
 
 from darswin.calibrate import Board, boards, find_corners
-from darswin.calibrate.boards import edge_width, pixels_per_unit, shown_instead, wrong
+from darswin.calibrate.boards import edge_width, misfit, pixels_per_unit, shown_instead, wrong
 from darswin.calibrate.circle import image_circle
 from darswin.lens import Equidistant, Lens, Perspective
 
@@ -109,7 +109,7 @@ def test_grids_may_begin_with_another_tag():
         assert np.isnan(find_corners(picture, other)).all()
         said = f"but the board has {first} to {first + 3}: is its first tag 30?"
         assert shown_instead(picture, other) == f"markers 30 to 33 of APRILTAG_36h11, {said}"
-        assert f"from `first_tag` {first} to {first + 3}, `gap` 18" in other.question
+        assert f"from `first_tag` {first} to {first + 3}, `gap` 18" in str(misfit(other, ""))
 
 
 def test_corners_between_slanted_squares_are_where_edges_cross_or_not_found():

@@ -47,7 +47,8 @@ def test_a_lens_is_estimated_and_written(rooms, tmp_path, capsys, monkeypatch):
         calibrate, "estimate", lambda *a, **o: estimates.append(estimate(*a, **o)) or estimates[0]
     )
     out, report = tmp_path / "camera.json", tmp_path / "report.json"
-    command = ["lens", "estimate", str(folder), "--out", str(out), "--report", str(report)]
+    command = ["lens", "estimate", str(folder), "--out", str(out), "--report", str(report),
+               "--model", "Spherical"]  # fmt: skip
     main(command)
     said, progress = capsys.readouterr()
     assert "straight curves over" in said and f"{out}: darswin, Spherical up to" in said
