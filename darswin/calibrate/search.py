@@ -269,7 +269,8 @@ class _Found:
         other = _Found(free, state, scale, views, self.used)
         for one in (self, other):
             one.judge(views, self.fits(self.sigma))
-        return _simplest([self, other])
+        fewer = len(more) < len(self.free.more)
+        return other if fewer or other.left_out < self.left_out else self
 
     def _significant(self, views: Views, square_pixels: bool | None) -> tuple[list[str], bool]:
         """The names of the numbers of the pixels and of the board's shape that are no chance, to
@@ -280,24 +281,19 @@ class _Found:
         extra = {name for group in open_ for name in group}
         free, confounded = Free(self.state.lens, (*held, *extra), self.state.shape), False
         vector = free.start
-        place, miss, counts, slopes, _ = self._normal(views, self.fits(self.sigma), free)
-        without = miss.new_zeros(int(place.max()) + 1, len(vector))
-        low, high, noise = free.low, free.high, max(self.sigma, SHARPEST) ** 2
+        _, miss, counts, slopes, _ = self._normal(views, self.fits(self.sigma), free)
+        low, high = free.low, free.high
         while open_:
             stay = torch.tensor([n in extra.difference(*open_) for n in free.names])
             free.low, free.high = (torch.where(stay, vector, end) for end in (low, high))
             normal = Normal(slopes, miss, counts.to(miss), free, vector).damped(0.0)
             step = normal.steps()[0, : len(vector)]
-            # By the noise, and by what changes where the pictures of a place are left out.
-            apart = without.index_put((place,), normal.steps(place)[:, : len(vector)] - step)
-            covariance = noise * normal.covariance()[:-3, :-3] + apart.mT @ apart
-            sure = {}
+            covariance, sure = normal.covariance(), {}
             for group in open_:
                 at = [free.names.index(name) for name in group]
                 value = (vector + step)[at] - float(group == PIXELS)  # a ratio of 1 is none
-                sure[group] = (
-                    (value @ torch.linalg.solve(covariance[at][:, at], value)).sqrt().item()
-                )
+                squared = value @ torch.linalg.solve(covariance[at][:, at], value)
+                sure[group] = squared.sqrt().item() / max(self.sigma, SHARPEST)
             chance = [group for group in open_ if not sure[group] > OFF]
             if not chance:
                 break
