@@ -16,7 +16,14 @@ from calibrate_peers import METHODS, NEEDS, FailedError, Given, Method
 from calibrate_tables import REAL
 from torch import Tensor
 
-from darswin.calibrate import Board, CalibratedLens, calibrate, find_corners, radial
+from darswin.calibrate import (
+    Board,
+    CalibratedLens,
+    CalibrationError,
+    calibrate,
+    find_corners,
+    radial,
+)
 from darswin.lens import Lens
 
 OPENCV = "/usr/share/doc/opencv-doc/examples/data"
@@ -67,7 +74,10 @@ def real_set(name: str, files: list[Path], tools: dict[str, str]) -> dict:
     corners, size = _corners(files, board)
     count = len(corners)
     corners = corners[np.isfinite(corners).all((1, 2))]
-    whole = calibrate(corners, board, size, "KannalaBrandt")
+    try:
+        whole = calibrate(corners, board, size, "KannalaBrandt")
+    except CalibrationError:  # of mirrors
+        whole = calibrate(corners, board, size)
     distance = whole.residuals.norm(dim=-1).numpy()
     wrong = distance > OFF * whole.sigma
     corners[wrong] = np.nan
