@@ -261,12 +261,15 @@ class _Found:
         """The same with those of PIXELS, BEND and STRETCH that are significant, and without others,
         as far as that predicts left-out pictures better, to first order."""
         more, confounded = self._significant(views, square_pixels)
+        # A stretch that was taken for that of the board looks sure when it is looked at again.
+        confounded = (self.confounded or confounded) and STRETCH[0] in more
         if {*more} == {*self.free.more}:
-            self.confounded = confounded and STRETCH[0] in more
+            self.confounded = confounded
             return self
         free, state = _state(self.state.lens, more, *self.state[2:])
         state, scale = refine(views._replace(seen=self.counts), free, state, stages=[FINE])
         other = _Found(free, state, scale, views, self.used)
+        other.confounded = confounded
         for one in (self, other):
             one.judge(views, self.fits(self.sigma))
         fewer = len(more) < len(self.free.more)
