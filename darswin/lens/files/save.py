@@ -32,10 +32,6 @@ IN_FRONT = {
 }
 
 
-class BeyondFormat(UserWarning):
-    """A warning of a lens that sees more than the program whose file holds it."""
-
-
 def save(
     lens: Lens,
     path: str | os.PathLike,
@@ -56,7 +52,7 @@ def save(
             Our own JSON keeps it beside the lens; other formats have no place for it.
 
     Warns:
-        BeyondFormat: the lens sees more than 90° from its axis, where the format's program knows
+        UserWarning: the lens sees more than 90° from its axis, where the format's program knows
             no rays of its model: OpenCV's fisheye, COLMAP's models, and Kalibr's with pinhole.
 
     Raises:
@@ -72,7 +68,7 @@ def save(
             f"{os.fspath(path)}: {writer.name} has no pixels for rays of 90° and more from the "
             f"axis of a {kind} lens, and wrong rays for their pixels, but this sees {end:.4g}°"
         )
-        warnings.warn(text, BeyondFormat, stacklevel=2)
+        warnings.warn(text, stacklevel=2)
     return format
 
 
