@@ -88,7 +88,7 @@ def test_dense(tmp_path, monkeypatch, threads):
     for module in (dense, dense_data):
         monkeypatch.setattr(module, "run_all", in_this_process)
     where = ["--out", str(tmp_path / "out"), "--results", str(tmp_path), "--seeds", "1", *FIT]
-    where += ["--pixels", "32", "--data.size", "32", "--pictures", "4", "1", "2"]
+    where += ["--pixels", "32", "--data.size", "32", "--pictures", "8", "1", "2"]
     dense.main([*where, "--cell", "swin-unet-low"])
     data, names = tmp_path / "out" / "data" / "test", dense_data.test_sets()
     sets = {name: open_scenes(str(data / name), "test", "labels") for name in names}
