@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -9,8 +10,11 @@ import cv2
 import numpy as np
 import torch
 
-from darswin.lens import Lens, load, save
+from darswin.lens import Lens, Stereographic, load, save
 from darswin.lens.pixels import pixel_rays
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+from rooms import Room
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 WOODSCAPE = CALIBRATIONS / "woodscape.json"
@@ -248,3 +252,33 @@ def write_outlines(folder: Path) -> Path:
     (folder / "annotations").mkdir()
     (folder / "annotations" / "instances_train.json").write_text(json.dumps(content))
     return folder
+
+
+# -- ordinary pictures -----------------------------------------------------------------------------
+
+
+def write_rooms(folder: Path, count: int) -> Lens:
+    """Pictures of rooms, with nine rays in each pixel, and the lens that sees them."""
+    size = (400, 480)
+    lens = Stereographic(torch.tensor([160.0], dtype=torch.float64), image_size=size)
+    side = torch.tensor([-1 / 3, 0, 1 / 3], dtype=torch.float64)
+    y, x = torch.meshgrid(*(torch.arange(n).double() for n in size), indexing="ij")
+    rays = [lens.unproject_points(torch.stack((x + dx, y + dy), -1)[None])[0].numpy()
+            for dx in side for dy in side]  # fmt: skip
+    folder.mkdir(exist_ok=True)
+    for k in range(count):
+        room = Room(np.random.default_rng(k))
+        colors = np.mean([room.colors(r.astype(np.float32)) for r in rays], 0)
+        cv2.imwrite(f"{folder}/{k}.png", colors.astype(np.uint8)[..., ::-1])
+    return lens
+
+
+def write_classes(folder: Path) -> np.ndarray:
+    """A folder of pictures for each of two classes; returns the last picture."""
+    random = np.random.default_rng(0)
+    for name in ("cat", "dog"):
+        (folder / name).mkdir(parents=True)
+        for k in range(12):
+            picture = random.integers(256, size=(48, 64, 3), dtype=np.uint8)
+            cv2.imwrite(str(folder / name / f"{k}.jpg"), picture)
+    return picture

@@ -13,8 +13,12 @@ import zipfile
 from fnmatch import fnmatch
 from pathlib import Path
 
+import calibrate_boards as boards
+import numpy as np
 import pytest
 import torch
+from graphs import write_constants
+from scenes import write_classes, write_outlines, write_rooms
 from torch_abi_audit import inspect_extension
 
 from darswin.frames import _frames
@@ -153,10 +157,44 @@ def unpacked(tmp_path_factory) -> Path:
     return sources
 
 
+def write_labels(folder: Path) -> None:
+    write_outlines(folder / "coco")
+    (folder / "coco" / "lens.json").rename(folder / "lens.json")
+    (folder / "flat.json").write_text('{"model": "Perspective", "fov_deg": 60}')
+
+
+def write_picture(folder: Path) -> None:
+    for name, of in (("a.jpg", "parking.jpg"), ("lens.json", "parking.json")):
+        shutil.copy(ROOT / "examples" / of, folder / name)
+    box = np.array([[[100, 100, 200, 200]]], np.float32)
+    values = dict(boxes=box, scores=box[..., 0] / 200, labels=box[..., 0].astype(np.int64))
+    write_constants(folder / "yolo.onnx", (256, 256), **values)
+
+
+# What README's first table takes for granted, by the command, and what the command leaves.
+ROWS = {
+    "calibrate": (lambda at: boards.main([f"{at}/photos", "--count", "8"]), "camera.json"),
+    "estimate": (lambda at: write_rooms(at / "photos", 2), "lens.json"),
+    "show": (write_picture, "lens.png"),
+    "predict": (write_picture, "found/overlays/a.jpg"),
+    "warp": (write_labels, "fisheye/annotations.json"),
+    "fit": (lambda at: write_classes(at / "photos"), "runs/a/checkpoints/best.safetensors"),
+}
+
+
 @pytest.mark.slow
-def test_the_lines_of_the_readme_install_darswin_and_classify_a_digit(unpacked):
+def test_the_lines_and_rows_of_the_readme_run_where_it_is_installed(unpacked, tmp_path):
     (answer,) = re.findall(r"^\[\n.*?^\]\n", (unpacked / "printed").read_text(), re.M | re.S)
     assert json.loads(answer)[0]["top"][0]["class"] == "4"  # as the page says
+    first, *_ = (ROOT / "README.md").read_text().partition("## DarSwin")
+    typed = re.findall(r"^\| .* \| `(.+)` \|$", first, re.M)
+    for (name, (write, left)), line in zip(ROWS.items(), typed, strict=True):
+        words, folder = shlex.split(line), tmp_path / name
+        assert name in words[:2]
+        folder.mkdir()
+        write(folder)
+        output(unpacked / "empty/bin/darswin", *words, cwd=folder, env=dict(PYTHONPATH=""))
+        assert (folder / left).stat().st_size > 0, line
 
 
 @pytest.mark.parametrize("optimized", [True, pytest.param(False, marks=pytest.mark.slow)])

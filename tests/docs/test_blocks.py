@@ -25,7 +25,7 @@ import pytest
 import torch
 from helpers import fixture
 from packaging.requirements import Requirement
-from scenes import write_outlines, write_plain, write_woodscape
+from scenes import write_classes, write_outlines, write_plain, write_woodscape
 from videos import write_video
 
 from darswin import frames, lens
@@ -81,12 +81,7 @@ def granted(tmp_path_factory):
     folder.mkdir()
     for name in ("examples", "darswin", "studies"):
         (folder / name).symlink_to(ROOT / name)
-    random = np.random.default_rng(0)
-    for name in ("cat", "dog"):
-        (folder / "photos" / name).mkdir(parents=True)
-        for k in range(12):
-            picture = random.integers(256, size=(48, 64, 3), dtype=np.uint8)
-            cv2.imwrite(str(folder / "photos" / name / f"{k}.jpg"), picture)
+    picture = write_classes(folder / "photos")
     for name in ("a.jpg", "b.jpg"):
         cv2.imwrite(str(folder / name), picture)
     write_plain(folder / "garage", 20, split="train")
