@@ -190,11 +190,18 @@ def zones_table(methods: dict) -> str:
     return markdown(heads, [[name, *map(percent, of["zones"])] for name, of in methods.items()])
 
 
+def main_methods(record: dict) -> dict:
+    methods = record["tables"][SPLITS["level"]]["methods"]
+    return {name: methods[name] for name in MAIN if name in methods}
+
+
 def lenses_table(record: dict) -> str:
     """The mAP of the main methods through each lens."""
-    methods = record["tables"][SPLITS["level"]]["methods"]
+    methods = main_methods(record)
     lenses = list(next(iter(methods.values()))["lenses"])
-    rows = [[name, *(f"{methods[name]['lenses'][lens]:.3f}" for lens in lenses)] for name in MAIN]
+    rows = [
+        [name, *(f"{of['lenses'][lens]:.3f}" for lens in lenses)] for name, of in methods.items()
+    ]
     return markdown(["mAP@0.5", *lenses], rows)
 
 
@@ -276,8 +283,7 @@ def tables(record: dict | None) -> dict[str, str]:
 
     made: dict[str, Callable[[dict], str]] = {
         "facts": facts, "lenses": lenses_table, "crops": crops_table, "speed": speed_table,
-        "zones": lambda record: zones_table(
-            {name: record["tables"][SPLITS["level"]]["methods"][name] for name in MAIN}),
+        "zones": lambda record: zones_table(main_methods(record)),
         "views": lambda record: views_table(record["tables"][SPLITS["level"]]["methods"]),
         **{split: lambda record, of=split: split_table(record["tables"][SPLITS[of]])
            for split in SPLITS},
