@@ -180,7 +180,7 @@ def from_curves(
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
-        + f", and known to {spread:.1%} at any radius below"
+        + f", and within {spread:.1%} at smaller radii"
     )
     ratio, oblong = math.exp(best.v[6]), raw.affine is not None
     auto = "" if model == "auto" else ", and the model auto may be closer"
