@@ -64,7 +64,7 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
         with torch.autocast("cpu", dtype=torch.bfloat16):
             return ours(image)
 
-    def drop_in(image):  # the call of docs/howto/use.md
+    def drop_in(image):  # the call of docs/howto/sampling.md
         return polar_sample(image, *arguments, samples=(1, 1), layout="image")
 
     maps = [(a.numpy(), b.numpy()) for a, b in zip(x, y, strict=True)]

@@ -77,7 +77,7 @@ def missed_line(timings: Sequence[Timing]) -> str:
 
 
 def drop_in_line(timings: Sequence[Timing]) -> str:
-    """How much faster the call of howto/use.md is than what it replaces."""
+    """How much faster the call of howto/sampling.md is than what it replaces."""
     found = [
         t
         for t in timings

@@ -71,6 +71,11 @@ VIEWS = {
     '`"tiles:5"`': "tiles: 5",
     '`"tiles:9"`': "tiles: 9",
 }
+# The methods in the tables of zones, lenses and times; the record has all.
+MAIN = (
+    "raw", "mercator", "raw, 1024²", "mercator, 1024²", "tiles: 4", "tiles: 5", "tiles: 9",
+    "tiles: 9, and mercator", "mercator, wrong lens", "tiles: 5, wrong lens",
+)  # fmt: skip
 SPLITS = {
     "level": "CenterNet, level",
     "small": "CenterNet, small",
@@ -185,9 +190,14 @@ def zones_table(methods: dict) -> str:
     return markdown(heads, [[name, *map(percent, of["zones"])] for name, of in methods.items()])
 
 
-def lenses_table(record: dict) -> str:
-    """The mAP of each method through each lens."""
+def main_methods(record: dict) -> dict:
     methods = record["tables"][SPLITS["level"]]["methods"]
+    return {name: methods[name] for name in MAIN if name in methods}
+
+
+def lenses_table(record: dict) -> str:
+    """The mAP of the main methods through each lens."""
+    methods = main_methods(record)
     lenses = list(next(iter(methods.values()))["lenses"])
     rows = [
         [name, *(f"{of['lenses'][lens]:.3f}" for lens in lenses)] for name, of in methods.items()
@@ -235,39 +245,45 @@ def speed_table(record: dict) -> str:
     rows = [
         [name, str(runs[name]["runs"]), f"{of['whole']:.0f}",
          "—" if name.startswith("raw") else f"{of['sampling']:.1f}", f"{of['merging']:.1f}"]
-        for name, of in record["speed"].items()
+        for name, of in record["speed"].items() if name in MAIN
     ]  # fmt: skip
     return markdown(["ms", "runs", "whole", "of that sampling", "merging"], rows)
 
 
 def facts(record: dict) -> str:
-    """How many scenes and things each split has."""
+    """How many scenes and objects each split has."""
     names = {
-        "level": "things of 15° to 50°",
-        "small": "things of 5° to 15°",
+        "level": "objects of 15° to 50°",
+        "small": "objects of 5° to 15°",
         "down": "a camera that looks down",
         "perspective": "a perspective lens of 90°",
         "people": "people in a video",
-        "second": "things of 15° to 50°, NanoDet",
+        "second": "objects of 15° to 50°, NanoDet",
     }
     rows = []
     for split, name in names.items():
         of = record["tables"][SPLITS[split]]
         flat = of.get("flat_recall")
         rows.append([name, str(of["scenes"]), str(of["things"]), percent(flat)])
-    return markdown(["", "pictures", "things", "recall in flat pictures"], rows)
+    return markdown(["", "pictures", "objects", "recall in flat pictures"], rows)
 
 
 def tables(record: dict | None) -> dict[str, str]:
     """The tables and figures by the name of their place in a page, or a line without a record."""
 
     def of_slices(make: Callable[[dict], str], split: str) -> Callable[[dict], str]:
-        """A table of slices, if the record has them."""
-        return lambda record: make(record["slices"][split]) if "slices" in record else NOT_RUN
+        """A table of slices, if the record has them, without the methods of the split's own."""
+
+        def shown(record: dict) -> dict:
+            found, known = record["slices"][split], record["tables"][SPLITS[split]]["methods"]
+            new = {name: of for name, of in found["methods"].items() if name not in known}
+            return {**found, "methods": new}
+
+        return lambda record: make(shown(record)) if "slices" in record else NOT_RUN
 
     made: dict[str, Callable[[dict], str]] = {
         "facts": facts, "lenses": lenses_table, "crops": crops_table, "speed": speed_table,
-        "zones": lambda record: zones_table(record["tables"][SPLITS["level"]]["methods"]),
+        "zones": lambda record: zones_table(main_methods(record)),
         "views": lambda record: views_table(record["tables"][SPLITS["level"]]["methods"]),
         **{split: lambda record, of=split: split_table(record["tables"][SPLITS[of]])
            for split in SPLITS},

@@ -54,7 +54,7 @@ def in_turn(rows, last):
 
 
 def slow_but(rows, *fast, marks=slow):
-    """The rows, for `parametrize`: all but some are slow, or have other marks."""
+    """The rows, for `parametrize`: all are slow, or have other `marks`, but those in `fast`."""
     return [
         pytest.param(
             *(row if isinstance(row, tuple) else [row]), marks=[] if row in fast else marks

@@ -44,11 +44,10 @@ _MOST_POINTS = 100_000  # of a polygon: a corner that is far away must not fill 
 def carry(
     boxes: Array, points_map: PointMap, size: tuple[int, int] | None = None
 ) -> tuple[Any, Any]:
-    """Carries boxes through a point map, by the ellipses inside them.
+    """Warps boxes by a point map, as the ellipses inside them.
 
-    The ellipse of a thing that is seen in part ends where the map does, and at the borders of the
-    new picture. Its new box is that of what is left. The new box of a turned one is turned as the
-    ellipse is that its ellipse becomes.
+    An ellipse is cut where the map ends and at the borders of the new picture. The new box is that
+    of what is left. A rotated box becomes the rotated box of its new ellipse.
 
     Args:
         boxes: (K, 4 or 5).

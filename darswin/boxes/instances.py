@@ -117,7 +117,7 @@ class Instances:
         return cls(**{name: _concatenated(of) for name, of in columns.items()}, more=more)
 
     def merged(self, *, iou: float = 0.5, inside: float = 0.7) -> Self:
-        """The best of those that show the same thing, the best first; see `darswin.boxes.merge`.
+        """The best of those that show the same object, best first; see `darswin.boxes.merge`.
 
         Raises:
             ValueError: there are no scores or no labels.

@@ -18,8 +18,8 @@ _RAYS = 360
 _TURN = np.linspace(-np.pi, np.pi, _RAYS, endpoint=False)
 _GRID = np.stack(np.meshgrid(*[(np.arange(16) + 0.5) / 16] * 2), -1).reshape(-1, 2)
 _SAME = 1e-3  # rad, or px at a border: places that differ by rounding
-# Points of a thing have a seam between them if they are far from each other in the new picture, and
-# nearer than this part of the thing in the old one.
+# Points of an object have a seam between them if they are far apart in the new picture, and nearer
+# than this part of the object in the old one.
 _NEAR = 1 / 3
 
 

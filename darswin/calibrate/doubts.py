@@ -23,7 +23,7 @@ SHOWN = 10  # corners
 
 
 class Note(str):
-    """A doubt on what is usual, or is taken care of. All others say what to act on."""
+    """A warning that needs no action: what it tells is usual, or was taken into account."""
 
 
 def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadiness) -> list[str]:

@@ -27,16 +27,25 @@ from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
 
-MOST, FEWEST = 120, 10  # curves: of a picture, and of all
+MOST = 120  # curves of a picture that are used
+FEWEST = 10  # curves of all pictures that an estimate needs
 STEP = 4  # points of an edge that are averaged
 FRAME = 0.03  # of the radius: lines along a side that are nearer to it are of a black frame
-BENDS, DEPTHS = np.linspace(-2, 0.3, 47), np.geomspace(0.2, 4, 24)  # a₁ and h₀ that are tried
+BENDS = np.linspace(-2, 0.3, 47)  # a₁ that are tried
+DEPTHS = np.geomspace(0.2, 4, 24)  # h₀ that are tried
 LOWS = 2  # depths that are looked into, for each ratio
-UNSURE, OFF, COVERED, AGREE = 0.05, 2.0, 0.8, 0.5  # of the rim's angle; px; of radius; of edges
-OPEN, REAL = 0.25, 0.005  # of any angle: more is unsure; less is not known of real cameras
-RATIOS, CLOSE = (-0.05, 0.0, 0.05), 1.5  # q; times the least cost: what is looked into
-SECOND = 3, 5  # lines of a picture that a second direction needs, and for no doubt
-SIGMAS, ROUNDS = 3.0, 3  # of an interval; of its search, if that has a better lens
+UNSURE = 0.05  # of the rim's angle: with a wider interval, the scale is not set
+OPEN = 0.25  # the same, of the angle at any radius
+OFF = 2.0  # px: a form that misses the lines by more gives a warning
+COVERED = 0.8  # of the radius: lines that end before give a warning
+AGREE = 0.5  # of the edges: fewer in orthogonal directions give a warning
+REAL = 0.005  # of any angle: by how much real cameras differ from every model
+RATIOS = -0.05, 0.0, 0.05  # q, the logarithm of the ratio of a pixel's sides, that are tried
+CLOSE = 1.5  # times the least cost: shapes that are looked into
+SECOND = 3  # lines that the second direction of a picture needs
+SEVERAL = 5  # lines: fewer in every picture's second direction give a warning
+SIGMAS = 3.0  # standard deviations on each side of an interval
+ROUNDS = 3  # of the search for an interval, if it finds a better lens
 SCALES = 0.03, 0.08, 0.15, 0.3, 0.6  # of the logarithm of h₀, from the best
 NARROWEST = math.radians(3)  # at the rim
 MORE = "give more pictures, or the field of view of the image circle if it is visible"
@@ -146,7 +155,7 @@ def from_curves(
     best, apart = _allowed(_search(Lines(pieces, np.array(picture), scale, *known)))
     along = [[(best.along[of] == k).sum() for k in range(3)] for of in best.lines.of.values()]
     second = np.sort(along)[:, 1]
-    if fov is None and second.max() < SECOND[0]:
+    if fov is None and second.max() < SECOND:
         raise CalibrationError(
             "straight lines alone do not tell the focal length, and no picture has several lines "
             f"in two orthogonal directions: {MORE}"
@@ -172,7 +181,7 @@ def from_curves(
     sigma, spread = float(sigmas[-1]), float((sigmas / angles).max())
     low, high = max(rim - sigma, 0.0), min(rim + sigma, math.pi)
     covered = len(np.unique(np.minimum(20 * best.rho, 19).astype(int))) / 20
-    oriented = (second >= SECOND[0]).sum()
+    oriented = (second >= SECOND).sum()
     unsure = sigma > UNSURE * rim or spread > OPEN
     sets = "hardly set" if unsure else "set"
     source = f"orthogonal directions in {oriented} of {len(curves)} pictures {sets} the scale"
@@ -180,11 +189,11 @@ def from_curves(
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
-        + f", and known to {spread:.1%} at any radius below"
+        + f", and within {spread:.1%} at smaller radii"
     )
     ratio, oblong = math.exp(best.v[6]), raw.affine is not None
     auto = "" if model == "auto" else ", and the model auto may be closer"
-    few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
+    few, disagree = (not fov and second.max() < SEVERAL), (not fov and best.agree < AGREE)
     doubts = {
         DIFFERENT: unsure,
         f"{form} is up to {error:.1f} px from what the lines show{auto}": error > OFF,
@@ -210,9 +219,8 @@ def _closest(name: str, raw: OCam, theta: Tensor) -> tuple[Lens, float] | None:
 
 def _curve(lens: Lens, radius: float) -> np.ndarray:
     """(20,) rad: θ at `RHO` times a radius in px."""
-    return lens.unproject(torch.from_numpy(radius * RHO).clamp(max=lens.r_max.item())[None])[
-        0
-    ].numpy()
+    radii = torch.from_numpy(radius * RHO).clamp(max=lens.r_max.item())
+    return lens.unproject(radii[None])[0].numpy()
 
 
 def _check(count: int) -> None:

@@ -72,7 +72,7 @@ def calibrate(
     """
     # These import OpenCV and the models; other commands of `lens` do not need them.
     from darswin.calibrate import CalibrationError
-    from darswin.calibrate import calibrate as found_by
+    from darswin.calibrate import calibrate as calibrate_corners
     from darswin.calibrate.doubts import out_of_reach
     from darswin.cli.pictures import files_at
     from darswin.utils.progress import Progress
@@ -106,7 +106,7 @@ def calibrate(
         raise ValueError("\n".join([why, *seen.broken.errors]))
     with Progress("calibrate") as progress:
         try:
-            found = found_by(
+            found = calibrate_corners(
                 seen.corners, made, seen.brightest.shape[:2], model, names=seen.names,
                 square_pixels=square_pixels, accept=lambda lens: is_held(lens, out, format),
                 progress=lambda step: setattr(progress, "step", step),

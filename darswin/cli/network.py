@@ -190,7 +190,7 @@ class NetworkAnswers(Answers):
         return self._boxes.wrong(self.network.path)
 
     def into(self, out: Path | None, names: Mapping[str, str]) -> Self:
-        """Says where files go, which numbers do not need; names: those of `file_names`."""
+        """Sets the folder of results, None for numbers alone, and the `file_names` of pictures."""
         self._out, self._names = out or Path(), names
         self._ids = picture_ids(names.values())
         self._free_ids = count(max(self._ids.values(), default=0) + 1)

@@ -145,15 +145,15 @@ def predict_network(
             {number: name}, as in a data.yaml; or a label map of TensorFlow (.pbtxt). The default
             is the names in the file of the network, if it has any.
         top: the number of classes to list for each image, if the network gives numbers of classes.
-        form: of the outputs of a detector, if they do not tell it: detect, pose, obb or segment of
+        form: of a detector's outputs, if the file does not say it: detect, pose, obb or segment of
             Ultralytics, softmax or sigmoid of the logits of transformers, or another word of the
             how-to about detectors; numbers if the network is no detector.
-        height: of the camera above a flat floor, in metres. Each detection then tells where it
-            stands: "floor" is metres to the right and ahead of the camera. It needs `up`.
-        radius: of things on the floor, in metres: 0.25 suits people. The default is 0, for their
+        height: of the camera above a flat floor, in metres. Each detection then has
+            "floor": where it stands, in metres to the right and ahead of the camera. It needs `up`.
+        radius: of objects on the floor, in metres: 0.25 suits people. The default is 0, for their
             nearest points.
         format: what else to write of detections, beside predictions.json: coco writes coco.json,
-            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, place and
+            the results that pycocotools reads; yolo writes labels/NAME.txt, with class, box and
             score in each line.
         every: the step between the frames of a video that are predicted; 1 predicts all.
         out: a folder that is new, empty, or from an earlier predict. It gets predictions.json and

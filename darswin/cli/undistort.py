@@ -52,7 +52,7 @@ def undistort(
             panorama or square. A perspective view shows straight lines straight, but its middle
             becomes coarse above 100°. A cylindrical view shows verticals straight. Equirectangular
             and Mercator views are parts of a map of the sphere; in a Mercator view and in a
-            stereographic one things keep their shape. A panorama shows all directions around the
+            stereographic one objects keep their shape. A panorama shows all directions around the
             vertical, for cameras that look down or up. A square shows the whole image disc, in
             equal steps of the incident angle.
         fov_deg: the horizontal field of view between the outer edges of a row, in degrees. The

@@ -14,7 +14,7 @@ class Sample(NamedTuple):
 
     The image is (H, W, C) uint8, and the lens is one lens with this image_size. The target is the
     label of each pixel, (H, W) uint8 with `IGNORE`; or its distance along the ray, (H, W) float32
-    metres with 0 for unknown; or the things in the picture; or the id of its class; or None.
+    metres with 0 for unknown; or the instances in the picture; or the id of its class; or None.
     """
 
     image: np.ndarray

@@ -33,7 +33,7 @@ class LensAdapter(Model[Any]):
       for each image. Lists, tuples and dicts of results may be nested.
 
     The network may come from timm, from segmentation_models_pytorch or from you, trained or not.
-    Pretrained weights want a view in which things stand upright and keep their shape: "mercator",
+    Pretrained weights need a view in which objects stand upright and keep their shape: "mercator",
     the default, for one run per image, "tiles" for several. A network that is trained from scratch
     may take the "square": the image disc by the concentric map, in which equal steps of θ are at
     equal distances from the centre, whatever the lens is. The adapter is called `adapter(images,

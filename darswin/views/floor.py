@@ -1,4 +1,4 @@
-"""Where things stand on the floor, by their boxes in a level view."""
+"""Where objects stand on the floor, by their boxes in a level view."""
 
 import math
 from typing import Any
@@ -46,13 +46,12 @@ def check_floor(view: Any, height: float, up: Any, radius: float) -> tuple[float
     above, own = unit_vector("up", up), getattr(view, "up", None)
     if own is None:
         raise ValueError(
-            "boxes tell where things stand only in a level view, such as mercator, panorama or a "
+            "boxes show where objects stand only in a level view, such as mercator, panorama or a "
             f"tile of tiles, got {view}"
         )
     if math.dist(own, above) > 2 * math.sin(_LEVEL / 2):
         shown = "({:.3g}, {:.3g}, {:.3g})".format
-        text = f"the view is level with up={shown(*own)}, not {shown(*above)}: make it so"
-        raise ValueError(text)
+        raise ValueError(f"the view is level with up={shown(*own)}, not {shown(*above)}")
     return above
 
 
@@ -62,10 +61,9 @@ def _search(
 ) -> np.ndarray:  # fmt: skip
     """The places (K, 2) of upright cylinders whose boxes in the view are those of a table (K, 4).
 
-    Where columns are not vertical, things lean, and the middle of a box's lower side is not below
-    the thing. Newton's method finds the place and the length of each thing, by three numbers of its
-    box: the ends along the lean, and the middle across it. The width is not used, since arms may
-    stick out.
+    Where columns are not vertical, objects lean, and the middle of a box's lower side is not below
+    them. Newton's method finds the place and the length of each, by three numbers of its box: the
+    ends along the lean, and the middle across it. The width is not used: arms may stick out.
     """
     state = np.concatenate((place, np.full((len(place), 1), height / 2)), 1)
     change = np.concatenate((np.zeros((1, 3)), _STEP * np.eye(3)))

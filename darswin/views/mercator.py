@@ -10,7 +10,7 @@ from darswin.views.registry import register_view
 
 @register_view("mercator")
 class MercatorView(RayView):
-    """A Mercator map about the vertical: things stand upright and keep their shape.
+    """A Mercator map about the vertical: objects stand upright and keep their shape.
 
     Columns are equal angles, and rows keep the scale of their columns, so that only sizes differ.
     Pretrained networks find most in this view, if they run once on each picture.
@@ -21,10 +21,8 @@ class MercatorView(RayView):
     upright = True
 
     def to_plane(self, rays: Tensor) -> Tensor:
-        level = length_of(rays[..., ::2])
-        return torch.stack(
-            (torch.atan2(rays[..., 0], rays[..., 2]), torch.asinh(rays[..., 1] / level)), -1
-        )
+        longitude, level = torch.atan2(rays[..., 0], rays[..., 2]), length_of(rays[..., ::2])
+        return torch.stack((longitude, torch.asinh(rays[..., 1] / level)), -1)
 
     def from_plane(self, points: Tensor) -> Tensor:
         longitude, y = points.unbind(-1)

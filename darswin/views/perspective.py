@@ -17,7 +17,7 @@ from darswin.views.registry import register_view
 class PerspectiveView(RayView):
     """A perspective picture around one `direction`: straight lines stay straight.
 
-    This is the picture for a network that looks at one thing, such as a classifier. It gets coarse
+    This is the picture for a network that looks at one object, as a classifier does. It is coarse
     in the middle above 100°, so a view of a whole lens ends there. The other arguments and the
     errors are those of `RayView`, but `fov` is below π.
 

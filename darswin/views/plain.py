@@ -13,7 +13,7 @@ from darswin.views.registry import register_view
 
 @register_view("none")
 class PlainView(PixelView):
-    """The images themselves: the network is not told their lens.
+    """The images themselves, for a network that does not know their lens.
 
     Args:
         size: (H, W) of the images; None for any size.

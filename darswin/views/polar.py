@@ -54,9 +54,8 @@ class PolarView(View):
         placement: "centers" puts the samples at the centres of equal cells; "edges" puts them from
             border to border, both included.
         theta_max: θ at the end of the last ring, rad, in (0, π), for every lens; None means θ_max
-            of each lens. With a fixed angle, things of one angular size have one size on the map,
-            whatever the lens. Samples beyond θ_max of a lens are zero. The spacings must be
-            "theta".
+            of each lens. With a fixed angle, the size of an object on the map does not depend on
+            the lens. Samples beyond θ_max of a lens are zero. The spacings must be "theta".
         jitter: how far a sample may move in training, in cells, in [0, 1]. The seed of each call
             comes from torch's generator.
         layout: "tokens" returns (B, R, A, S_r·S_φ·C), "image" returns (B, C, R·S_r, A·S_φ).

@@ -152,7 +152,7 @@ class Remap:
         return self._boxes(boxes, self.to_view, sizes, self.rays_of_image)
 
     def floor(self, boxes: Any, height: float, up: Vector, radius: float = 0.0) -> Any:
-        """Where the things in boxes (K, 4) of a level view stand on the floor, (K, 2) in metres.
+        """Where the objects in boxes (K, 4) of a level view stand on the floor, (K, 2) in metres.
 
         The origin is below the camera. y is ahead: along the level part of the optical axis, or of
         the picture's top if the axis is within 10° of the vertical. x is to the right of it.
@@ -160,11 +160,11 @@ class Remap:
         Args:
             height: of the camera above the floor, m.
             up: the direction away from gravity in the camera's frame. The view is level with it.
-            radius: of the things, which are upright cylinders, m. 0 finds their nearest points.
+            radius: of the objects, which are upright cylinders, m. 0 finds their nearest points.
 
         Returns:
             NaN for a box without an area, and where its lower side is not below the horizon, or at
-            the lower edge of the view, where a thing may be cut.
+            the lower edge of the view, where an object may be cut.
 
         Raises:
             ValueError: a number is out of its range, or the view is not level with `up`.

@@ -28,9 +28,8 @@ class SquareView(PixelView):
     Args:
         size: (S, S) of the view.
         fov: the horizontal field of view between the outer edges of the middle row, rad. None means
-            twice θ_max of each lens. The size of a thing in the square then depends on the lens,
-            and the network is not told. If sizes matter, as for distances, give that of your widest
-            lens. The square is 0 beyond θ_max of a lens.
+            twice θ_max of each lens. The size of an object in the square then depends on the lens:
+            if sizes matter, give that of your widest lens. The square is 0 beyond θ_max of a lens.
         spacing: the spacing from the centre of the square to its edge; see `darswin.lens.spacing`.
         mean, std: the arguments of `View`.
 

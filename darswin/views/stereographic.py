@@ -1,4 +1,4 @@
-"""A stereographic picture, as a lens that keeps the shape of things would take it."""
+"""A stereographic picture, as a lens that keeps the shape of objects would take it."""
 
 import math
 
@@ -11,7 +11,7 @@ from darswin.views.registry import register_view
 
 @register_view("stereographic")
 class StereographicView(RayView):
-    """A stereographic picture: things keep their shape, and lean away from the middle.
+    """A stereographic picture: objects keep their shape, and lean away from the middle.
 
     The middle column is level with `up`. The arguments and errors are those of `RayView`.
     """

@@ -43,7 +43,7 @@ class TilesView(PixelView):
 
     A network sees B·n images, the n tiles of each image in turn. Its maps come back to the pixels
     of the images: each pixel takes the tile in which it is farthest from a border. A `LensAdapter`
-    carries boxes back and merges those of all tiles. Each tile is level with `up`.
+    warps boxes back and merges those of all tiles. Each tile is level with `up`.
 
     Args:
         size: (H', W') of a tile. Tiles that are much smaller than 512 pixels find less than one

@@ -241,7 +241,7 @@ def test_the_spread_is_of_the_whole_curve_and_of_the_model(model):
     off, of_rim = (theta / true - 1).abs(), (found.interval[1] - found.rim) / found.rim
     assert off.max() < 3 * found.spread and off[-1] < 3 * of_rim <= 3 * found.spread
     assert found.spread > (0.05 if model == "Equidistant" else 0.004)
-    assert f"known to {found.spread:.1%}" in found.verdict
+    assert f"within {found.spread:.1%}" in found.verdict
 
 
 NOISE = np.random.default_rng(0).integers(0, 256, (64, 64)).astype(np.uint8)

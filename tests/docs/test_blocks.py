@@ -250,7 +250,7 @@ PROGRAMS: dict[str, Callable] = {
 # -- the namespaces that the blocks of some pages leave, one for each ---------------------------
 
 
-def check_use(*after: dict) -> None:
+def check_sampling(*after: dict) -> None:
     """The drop-in gives the values of what it replaces."""
     scope = next(scope for scope in after if "polar" in scope)
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
@@ -305,5 +305,5 @@ def check_answers(*answers: dict) -> None:
 RESULTS: dict[str, Callable] = {
     "answers": check_answers,
     "detector": check_detector,
-    "use": check_use,
+    "sampling": check_sampling,
 }

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 SIDES, MIDDLE, CORNERS = "x, y, width, height", "the middle, width, height", "x0, y0, x1, y1"
-# Of a box (a, b): how many of them it takes to tell, as things that are cut off may reach beyond
+# Of a box (a, b): how many of them a decision needs, as boxes of cut-off objects may reach beyond
 # the picture; and the factors of its first corner, a + start b, and its last, step first + b.
 _FORMS = {CORNERS: (3, 0.0, 0.0), SIDES: (20, 0.0, 1.0), MIDDLE: (20, -0.5, 1.0)}
 _OVER = 0.02  # a share of a side: boxes that reach farther beyond the picture are odd
 _ODD, _FEW = 0.1, 0.02  # with more odd boxes a form does not fit, with fewer it does
-_FAR = 1.5  # times a side: most numbers of a thing are less
+_FAR = 1.5  # times a side: most numbers of a box are less
 _PIXEL = 1.1  # px: no file has all its numbers in the first pixel
 
 
