@@ -208,8 +208,10 @@ def test_a_compiled_model_keeps_nothing_of_a_lens():
     images, lenses = torch.rand(1, 3, 32, 32), [Spherical.from_fov(0.5, f, 16.0) for f in (3, 1.8)]
     expected = [model.eval()(images, lens) for lens in lenses]
     compiled = torch.compile(model, backend="eager")
+    run = torch.compile(model.run, backend="eager", fullgraph=True)
     for lens, right in zip(lenses, expected, strict=True):
         assert_close(compiled(images, lens), right, atol=1e-4, rtol=1e-4)
+        assert_close(run(images, model.prepare(lens, (32, 32))), right, atol=1e-4, rtol=1e-4)
         assert_close(model(images, lens), right)
     assert_close(model(images, lenses[0]), expected[0])
 
