@@ -45,9 +45,8 @@ class Nerfstudio(Format):
         return has_several(keys, MARKS) or {ANGLES[0], "w", "h"} <= keys
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        frames = file.get("frames", "a list of mappings") if "frames" in file else []
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise ValueError(f"frames must be a list of mappings, got {short(frames)}")
+        sections = file.sections("frames") if "frames" in file else []
+        frames = [section.entries for section in sections]
         # Entries at the top level override those of the frames; one coefficient at the top level
         # overrides all coefficients of the frames.
         shared = {key: file.entries[key] for key in _of_camera(file.entries)}
@@ -74,7 +73,7 @@ def _of_camera(keys: Iterable[str]) -> set[str]:
     }  # fmt: skip
 
 
-def _frame(shared: dict[str, Any], own: set[str], frame: dict, where: str) -> Description:
+def _frame(shared: dict[str, Any], own: set[str], frame: Mapping, where: str) -> Description:
     return _camera(Fields(shared | {key: frame[key] for key in own if key in frame}, where))
 
 
