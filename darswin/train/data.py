@@ -13,7 +13,6 @@ from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
-from darswin.data.framing import CutOff
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
@@ -213,7 +212,7 @@ class RunData(LightningDataModule):
         self.datasets.append(dataset)
         if not self._said_cut_off and not self._place["rank"] and (lost := dataset.cut_off()):
             self._said_cut_off = True
-            said = CutOff(f"`fit` crop cuts off {lost}; `fit` stretch keeps it")
+            said = UserWarning(f"`fit` crop cuts off {lost}; `fit` stretch keeps it")
             warnings.warn(naming(said, "fit"), stacklevel=2)
         return dataset
 
