@@ -103,7 +103,7 @@ class RandomErasing:
         channels, height, width = image.shape
         for _ in range(10):
             area = rng.uniform(*self.AREA) * height * width
-            aspect = math.exp(rng.uniform(*map(math.log, self.ASPECT)))
+            aspect = math.exp(rng.uniform(math.log(self.ASPECT[0]), math.log(self.ASPECT[1])))
             h, w = round(math.sqrt(area * aspect)), round(math.sqrt(area / aspect))
             if h < height and w < width:
                 top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
