@@ -1,5 +1,6 @@
 """Scenes: pictures with a label or a distance for each pixel, and readers of their data sets."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -20,7 +21,8 @@ from darswin.data.splits import check_split
 from darswin.utils.parameters import check
 
 # The first reader that recognizes a path opens it. The last words say what a data set lacks.
-READERS = (
+Reader = tuple[Callable[[Path], bool], Callable[[Path, Options], Scenes], dict[str, str]]
+READERS: tuple[Reader, ...] = (
     (is_plain, open_plain, {}),
     (is_kitti360, open_kitti360, {"labels": "KITTI-360, whose fisheye pictures have no labels"}),
     (is_synwoodscape, open_synwoodscape, {}),
