@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import ended
 
 from darswin import calibrate
 from darswin import lens as lenses
@@ -62,9 +63,7 @@ def test_a_lens_is_estimated_and_written(rooms, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibrate.Estimate, "is_sure", False)
     out.unlink()
     report.unlink()
-    with pytest.raises(SystemExit):
-        main(command)
-    said = capsys.readouterr().err
+    said = ended(capsys, 2, main, command).err
     assert "camera.json is not written, because the pictures allow very different" in said
     assert "--accept_doubts" in said and report.exists() and not out.exists()
     main([*command, "--accept_doubts", "true"])
