@@ -7,7 +7,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from helpers import ended
 from lens_examples import FILES, FRONT
 
 from darswin.cli.main import main
@@ -376,8 +375,10 @@ def test_misuse_is_one_sentence(world, request, monkeypatch, capsys, command, sa
         monkeypatch.setattr("darswin.cli.main.resolve_name", None)  # it imports the command
     monkeypatch.chdir(world)
     before = state_of(world)
-    printed = ended(capsys, 2, main, command.split())
-    assert not printed.out and "Traceback" not in printed.err
+    with pytest.raises(SystemExit) as end:
+        main(command.split())
+    printed = capsys.readouterr()
+    assert end.value.code == 2 and not printed.out and "Traceback" not in printed.err
     line = printed.err.splitlines()[-1]  # after what a network is, and signs of life
     assert re.match("darswin|error: ", line) and re.search(said, line), line
     assert state_of(world) == before
