@@ -153,6 +153,14 @@ def in_this_process(work, jobs, *_):
     return [work(*job) for job in jobs]
 
 
+def ended(capsys, code, function, *arguments, **options):
+    """What a command prints, as `out` and `err`, that ends with this exit code."""
+    with pytest.raises(SystemExit) as end:
+        function(*arguments, **options)
+    assert end.value.code == code
+    return capsys.readouterr()
+
+
 def refused(said, function, *arguments, error=ValueError, **options):
     """The message of the error with which a call ends; it must have these words."""
     with pytest.raises(error, match=said) as caught:

@@ -22,7 +22,7 @@ def png(stored, bits=8, kind=GREY, palette=None, interlaced=False):
     if palette is not None:
         chunks.append((b"PLTE", np.asarray(palette, np.uint8).tobytes()))
     chunks += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*chunk) for chunk in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*each) for each in chunks)
 
 
 def _packed(row, bits):
@@ -31,5 +31,5 @@ def _packed(row, bits):
     return int(digits, 2).to_bytes(len(digits) // 8, "big")
 
 
-def _chunk(name, data):
+def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

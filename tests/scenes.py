@@ -22,6 +22,13 @@ CLASSES = {"names": ["sky", "ground", "wall"], "colors": [[0, 0, 255], [0, 128, 
 SIZE = (121, 160)
 
 
+def drawn(polygons: Sequence[np.ndarray], size: tuple[int, int], fine: int = 4) -> np.ndarray:
+    """How much of each pixel polygons cover, up to 255, by OpenCV in a finer picture."""
+    points = [np.round((p * fine - 0.5) * 16).astype(np.int32) for p in polygons]
+    mask = cv2.fillPoly(np.zeros(np.array(size) * fine, np.uint8), points, 255, shift=4)
+    return cv2.resize(mask, size[::-1], interpolation=cv2.INTER_AREA)
+
+
 def labels_of(theta: np.ndarray, azimuth: np.ndarray, classes: int = 3) -> np.ndarray:
     """Labels as a function of the ray: sectors of azimuth that change with every 0.4 rad of θ."""
     sector = np.floor(np.nan_to_num(azimuth) / (2 * np.pi) * 6 + 6)

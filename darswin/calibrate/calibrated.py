@@ -77,13 +77,8 @@ class CalibratedLens:
         """
         pixels = as_tensor(pixels, torch.float64)
         lens = self.lens.with_theta_max(None)
-        rays, count = lens.unproject_points(pixels.reshape(-1, 2)), len(self._vector)
-
-        def points(numbers: Tensor) -> Tensor:
-            turned = torch.linalg.cross(*torch.broadcast_tensors(numbers[:, None, count:], rays))
-            return self._free.at(numbers[:, :count], lens.theta_max).project_points(rays + turned)
-
-        slopes = slopes_of(points, torch.cat((self._vector, torch.zeros(3).to(rays))))
+        rays = lens.unproject_points(pixels.reshape(-1, 2))
+        slopes = self._free.slopes(self._vector, lens.theta_max, rays)
         (a, b), (_, d) = ((slopes @ self._joint @ slopes.mT)[:, k].unbind(1) for k in (0, 1))
         spread = (a + d) / 2 + torch.hypot(b, (a - d) / 2)
         return spread.sqrt().reshape(pixels.shape[:-1])

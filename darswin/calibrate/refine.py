@@ -100,6 +100,17 @@ class Free:
         limits = {"theta_max": theta_max.expand(len(vectors))}
         return self.model._from_tensors(self.tensors(vectors) | limits)
 
+    def slopes(self, vector: Tensor, theta_max: Tensor, rays: Tensor) -> Tensor:
+        """(K, 2, n + 3): the derivatives of the pixels of rays (K, 3) by the numbers, and by a turn
+        of the rays."""
+        count = len(vector)
+
+        def pixels(numbers: Tensor) -> Tensor:
+            turned = torch.linalg.cross(*torch.broadcast_tensors(numbers[:, None, count:], rays))
+            return self.at(numbers[:, :count], theta_max).project_points(rays + turned)
+
+        return slopes_of(pixels, torch.cat((vector, vector.new_zeros(3))))
+
     def shape(self, vector: Tensor) -> Tensor:
         """(3,): the shape of the board of a vector (n,)."""
         count = int(self.shaped.sum())

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from darswin.calibrate.refine import SHARPEST, Free, Views
 from darswin.lens import Lens
-from darswin.lens.fitting import slopes_of
 
 FEW = 8  # places of the board
 GRID, MOST = 15, 0.95  # of pixels along a side; the part of the rays that is no more unsure
@@ -49,13 +48,7 @@ def unsure(
     lens = lens.with_theta_max(None)
     rays = lens.unproject_points(torch.cartesian_prod(*sides).flip(-1))
     rays = rays[torch.atan2(rays[:, :2].norm(dim=1), rays[:, 2]) <= top]
-
-    def pixels(numbers: Tensor) -> Tensor:
-        axes = numbers[:, None, len(vector) :]
-        turned = torch.linalg.cross(*torch.broadcast_tensors(axes, rays))
-        return free.at(numbers[:, : len(vector)], lens.theta_max).project_points(rays + turned)
-
-    slopes = slopes_of(pixels, torch.cat((vector, vector.new_zeros(3))))
+    slopes = free.slopes(vector, lens.theta_max, rays)
     slopes = slopes[slopes.isfinite().flatten(1).all(1)]
     # The smallest turn of a ray that takes its pixel back.
     by_number, by_turn = slopes.split((len(vector), 3), -1)

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.cli.pictures import ByLens
-from darswin.data.framing import CutOff, FullSize, cut_off, fitted
+from darswin.data.framing import FullSize, cut_off, fitted
 from darswin.data.scenes.targets import PER_METRE
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
@@ -96,7 +96,7 @@ class ModelAnswers(Answers):
 
     def __init__(self, model: Encoder | PixelModel, card: ModelCard):
         super().__init__(model.in_chans)
-        self.model, self.card = model, card
+        self.model, self.card = fast(model, card), card
         self._lens: Lens | None = None  # of the queue
         self._queue: list[Request] = []
         self._warned = False
@@ -133,7 +133,7 @@ class ModelAnswers(Answers):
                 "was trained on cropped pictures; `darswin fit --data.fit stretch` trains one that "
                 "sees all of them"
             )
-        warnings.warn(f"the model does not see {lost}, because it {reason}", CutOff, stacklevel=2)
+        warnings.warn(f"the model does not see {lost}, because it {reason}", stacklevel=2)
 
     def flush(self) -> None:
         """Predicts the images in the queue; FloatingPointError if the model computes NaN."""
@@ -162,7 +162,7 @@ class ModelAnswers(Answers):
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         """The network's output (B, …) for images (B, C, h, w)."""
-        raise NotImplementedError
+        return self.model.run(images, prepared)
 
     def _answer(self, request: Request, output: Tensor, full: Any) -> dict[str, Any]:
         raise NotImplementedError
@@ -174,7 +174,7 @@ class ClassAnswers(ModelAnswers):
     model: Encoder
 
     def __init__(self, model: Encoder, card: ModelCard, top: int):
-        super().__init__(fast(model, card), card)
+        super().__init__(model, card)
         self.top = top
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -197,14 +197,11 @@ class PixelAnswers(ModelAnswers):
     model: PixelModel
 
     def __init__(self, model: PixelModel, card: ModelCard, out: Path, names: Mapping[str, str]):
-        super().__init__(fast(model, card), card)
+        super().__init__(model, card)
         self.out, self.names = out, names
 
     def _full_size(self, remap: Remap, prepared: Prepared) -> FullSize:
         return FullSize(remap, prepared.view.shown)
-
-    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
-        return self.model.run(images, prepared)
 
     def _answer(self, request: Request, output: Tensor, full: FullSize) -> dict[str, Any]:
         content, picture, where, summary = self._picture(request, output.float().numpy(), full)

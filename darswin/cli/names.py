@@ -47,14 +47,10 @@ def _listed(content: Any) -> dict[int, str]:
     for key in ("names", "id2label"):  # of Ultralytics, and of configurations of transformers
         if isinstance(content, dict) and key in content:
             content = content[key]
-    pairs = content.items() if isinstance(content, dict) else enumerate(_list_of(content))
-    return _named((number, name) for number, name in pairs if name is not None)
-
-
-def _list_of(content: Any) -> list[Any]:
-    if not isinstance(content, list):
+    if not isinstance(content, dict | list):
         raise ValueError(f"it has no list of names, but {content!s:.60}")
-    return content
+    pairs = content.items() if isinstance(content, dict) else enumerate(content)
+    return _named((number, name) for number, name in pairs if name is not None)
 
 
 def _named(pairs: Iterable[tuple[Any, Any]]) -> dict[int, str]:

@@ -40,14 +40,6 @@ from darswin.viz.pixels import draw_instances, label_image, overlay, palette
 VIEW, THRESHOLD, RESULTS = "mercator", 0.3, "coco.json"
 
 
-class Logits(UserWarning):
-    """A note on outputs that become probabilities."""
-
-
-class Emptied(UserWarning):
-    """A warning of boxes that were left out because they are none."""
-
-
 class Boxes:
     """Counts the boxes of a network, and those that have no area."""
 
@@ -67,7 +59,7 @@ class Boxes:
             f"{self.without_area} of {self.count} boxes of {network} have no area and are left out"
         )
         if 2 * self.without_area <= self.count:
-            warnings.warn(text, Emptied, stacklevel=2)
+            warnings.warn(text, stacklevel=2)
             return None
         return (
             f"{text}. They may be centres and sizes, or y before x; the graph must give the "
@@ -331,7 +323,7 @@ class NetworkAnswers(Answers):
         key = "probability"
         if values.min() < 0 or values.max() > 1:
             text = f"{self.network.path} gives logits: their softmax are the probabilities"
-            warnings.warn(text, Logits, stacklevel=2)
+            warnings.warn(text, stacklevel=2)
             values = np.exp(values - values.max())
             values /= values.sum()
         elif abs(values.sum() - 1) > 1e-2:  # of half precision

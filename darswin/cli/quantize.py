@@ -58,7 +58,8 @@ def quantize(
     model, card = load_model(weights)
     with _with_names_of(Path(run)):
         config = yaml.safe_load(read_text(Path(run) / "config.yaml"))
-        data = _data_of(config)
+        options = config["data"] | dict(batch_size=BATCH, workers=0)
+        data = TASKS[config.get("task", FIRST_TASK)].data(**options)
         with Progress("reading training pictures"):
             seen = list(_batches(data, "train", pictures))
         if (config.get("trainer") or {}).get("limit_val_batches") == 0:
@@ -92,12 +93,6 @@ def _with_names_of(run: Path) -> Iterator[None]:
     except (OSError, ValueError) as error:
         said = with_flags(error, "data.{}".format)
         raise ValueError(f"the data of {run / 'config.yaml'}: {said}") from None
-
-
-def _data_of(config: dict[str, Any]) -> RunData:
-    """The data of a run, from its configuration."""
-    options = config["data"] | dict(batch_size=BATCH, workers=0)
-    return TASKS[config.get("task", FIRST_TASK)].data(**options)
 
 
 def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Lens, Tensor]]:

@@ -15,10 +15,6 @@ from darswin.views.registry import flat_views, view_class
 Up = tuple[float, float, float]
 
 
-class NarrowView(UserWarning):
-    """The warning of a field of view that looks like radians in place of degrees."""
-
-
 class Look(NamedTuple):
     """The options of an undistorted view; its name is one of `flat_views()`."""
 
@@ -89,7 +85,7 @@ def _check_fov_and_up(view: str, fov_deg: float | None, up: Sequence[float] | No
     check("fov_deg", fov_deg, 0 < math.radians(fov_deg) <= widest, most)
     if fov_deg <= 2 * math.pi:
         text = f"--fov_deg {fov_deg:g} is a narrow view; {fov_deg:g} rad would be "
-        warnings.warn(f"{text}{math.degrees(fov_deg):.4g}°", NarrowView, stacklevel=3)
+        warnings.warn(f"{text}{math.degrees(fov_deg):.4g}°", stacklevel=3)
 
 
 def to_corners(lens: Lens) -> Lens:

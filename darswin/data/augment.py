@@ -85,19 +85,16 @@ class RandAugment:
 class RandomErasing:
     """With probability p, replaces a random box of a normalised image by noise N(0, 1).
 
-    The share of the area is uniform in `area`, and the aspect ratio is log-uniform in `aspect`. If
+    The share of the area is uniform in `AREA`, and the aspect ratio is log-uniform in `ASPECT`. If
     ten boxes do not fit, the image stays as it is.
 
     Source: Zhong et al., Random Erasing, 2020, in timm's "pixel" mode.
     """
 
-    def __init__(
-        self,
-        p: float = 0.25,
-        area: tuple[float, float] = (0.02, 1 / 3),
-        aspect: tuple[float, float] = (0.3, 1 / 0.3),
-    ):
-        self.p, self.area, self.aspect = p, area, aspect
+    AREA, ASPECT = (0.02, 1 / 3), (0.3, 1 / 0.3)
+
+    def __init__(self, p: float = 0.25):
+        self.p = p
 
     def __call__(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The image (C, H, W) float32, changed in place."""
@@ -105,8 +102,8 @@ class RandomErasing:
             return image
         channels, height, width = image.shape
         for _ in range(10):
-            area = rng.uniform(*self.area) * height * width
-            aspect = math.exp(rng.uniform(math.log(self.aspect[0]), math.log(self.aspect[1])))
+            area = rng.uniform(*self.AREA) * height * width
+            aspect = math.exp(rng.uniform(math.log(self.ASPECT[0]), math.log(self.ASPECT[1])))
             h, w = round(math.sqrt(area * aspect)), round(math.sqrt(area / aspect))
             if h < height and w < width:
                 top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)

@@ -60,10 +60,6 @@ def size_of_part(part: Part, size: int, fit: Fit) -> tuple[int, int]:
     return round(height * scale), round(width * scale)
 
 
-class CutOff(UserWarning):
-    """A warning of parts of pictures that a model does not see."""
-
-
 def cut_off(size: tuple[int, int], lens: Lens | None, fit: Fit) -> str | None:
     """What a fit cuts off pictures of (H, W), in words; None if nothing is lost.
 
@@ -117,7 +113,7 @@ class FullSize:
         assert isinstance(remap.view, CropView) and remap.camera is not None
         top, left, self._height, self._width = remap.view.part
         self._part = np.s_[top : top + self._height, left : left + self._width]
-        self.reached = _reached(remap.camera)
+        self.reached = ~np.isnan(_angles(remap.camera))
         near = self._enlarged(self.reached)
         if shown is not None:
             self.reached &= shown.cpu().numpy().reshape(self.reached.shape)
@@ -175,11 +171,6 @@ class FullSize:
         whole[self._part] = values
         whole[~self.seen] = missing
         return whole
-
-
-def _reached(lens: Lens) -> np.ndarray:
-    """True for pixels that a ray of the lens reaches, (H, W)."""
-    return ~np.isnan(_angles(lens))
 
 
 def _angles(lens: Lens) -> np.ndarray:

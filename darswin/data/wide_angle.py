@@ -73,7 +73,7 @@ class WideAngle(Samples):
         sample = Sample(picture, label, _view(self.fov, len(picture)))
         # A turn leaves the lens as it is, which is round and in the middle.
         return sample.through(
-            CameraView(self._first_lens(draw), turn=self._turn(draw), supersampling=1)
+            CameraView(self._lens_alone(draw), turn=self._turn(draw), supersampling=1)
         )
 
     def _view(self, own: Lens, draw: Draw) -> CameraView | CropView:
@@ -86,9 +86,6 @@ class WideAngle(Samples):
         return (height, width), None
 
     def _lens_alone(self, draw: Draw) -> Lens:
-        return self._first_lens(draw)
-
-    def _first_lens(self, draw: Draw) -> Lens:
         """The lens of a picture of `render` px."""
         lens = self._drawn(self.lenses, draw, 1, self.fov, None)
         return lens.resized((self.render, self.render))

@@ -1,7 +1,9 @@
 """Models as graphs of tensors, lens included: for AOTInductor, ONNX, and processes without us."""
 
 import contextlib
+import logging
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from inspect import Parameter, Signature
@@ -21,7 +23,6 @@ from darswin.models.base import Model
 from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
-from darswin.utils.quiet import quiet_export
 from darswin.views.base import Pair
 
 __all__ = ["export_onnx", "export_package", "export_program"]
@@ -29,16 +30,30 @@ __all__ = ["export_onnx", "export_package", "export_program"]
 Input = Literal["images", "tokens"]
 
 
+_LOGGERS = ("torch.onnx", "onnxscript", "onnx_ir")
+
+
 @contextlib.contextmanager
-def _without_traces() -> Iterator[None]:
-    """A context, or a decorator, in which torch keeps no stack trace of each node: these help to
-    find errors in an exporter, and take a tenth of its time. Before torch 2.12 it always does."""
+def quiet_export() -> Iterator[None]:
+    """A context, or a decorator, without the exporters' log lines below errors, without warnings of
+    what will change in the packages themselves, and without a stack trace of each node: these help
+    to find errors in an exporter, and take a tenth of its time. Before torch 2.12 it always keeps
+    them."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    levels = [logger.level for logger in loggers]
     before = getattr(torch.fx.config, "do_not_emit_stack_traces", False)
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     torch.fx.config.do_not_emit_stack_traces = True
     try:
-        yield
+        with warnings.catch_warnings():
+            for category in (FutureWarning, DeprecationWarning):
+                warnings.simplefilter("ignore", category)
+            yield
     finally:
         torch.fx.config.do_not_emit_stack_traces = before
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 class _OfTensors(nn.Module):
@@ -133,7 +148,6 @@ def export_program(
 
 
 @quiet_export()
-@_without_traces()
 def _program(
     model: nn.Module,
     images: Tensor,
@@ -191,8 +205,10 @@ def _join_equal_nodes(graph: torch.fx.Graph) -> None:
     Newton's steps. All that follows takes time for every node: decompositions, rules, compilers."""
     nodes, apart = list(graph.nodes), set[torch.fx.Node]()
     for node in reversed(nodes):
-        # What is changed in place must not be the result of another node too.
-        changes = isinstance(node.target, OpOverload) and _has_effects(node.target)
+        # What is changed in place must not be the result of another node too, nor what is random.
+        changes = isinstance(node.target, OpOverload) and (
+            node.target._schema.is_mutable or torch.Tag.nondeterministic_seeded in node.target.tags
+        )
         if changes or (node in apart and _may_share_memory(node.target)):
             apart.update((node, *node.all_input_nodes))
     apart.update(graph.output_node().all_input_nodes)  # their names are those of the outputs
@@ -205,11 +221,6 @@ def _join_equal_nodes(graph: torch.fx.Graph) -> None:
         if (first := known.setdefault(key, node)) is not node:
             node.replace_all_uses_with(first)
             graph.erase_node(node)
-
-
-def _has_effects(operator: OpOverload) -> bool:
-    """True if an operator changes a tensor in place, or draws random numbers."""
-    return operator._schema.is_mutable or torch.Tag.nondeterministic_seeded in operator.tags
 
 
 def _may_share_memory(target: object) -> bool:
@@ -268,7 +279,6 @@ def export_package(
 
 
 @quiet_export()
-@_without_traces()
 def export_onnx(
     model: nn.Module,
     path: str | os.PathLike,

@@ -1,6 +1,6 @@
 """The rules by which functions become instructions: see record.py."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from darswin.deploy.hidden import PICTURES
 from darswin.deploy.own import OwnLinear, OwnNorm
 from darswin.deploy.packed import OwnBlocks
-from darswin.deploy.program import GELU, RELU, NoProgramError
+from darswin.deploy.program import GELU, RELU, NoProgramError, Slot
 from darswin.deploy.record import Recorded, inverse, lowers
 from darswin.lens.pixels import OUTSIDE, sample_at
 from darswin.models.pixel import distances
@@ -92,27 +92,25 @@ def _(x: Tensor, y: Tensor) -> Recorded:
 def _(x: Recorded, approximate: str = "none") -> Recorded:
     if approximate != "none":
         raise NoProgramError(f"an approximate GELU, {approximate}, is no instruction")
-    return _applied(GELU, x)
+    return _applied(x, x.writer.program.apply, GELU)
 
 
 @lowers(F.relu, torch.relu, Tensor.relu)
 def _(x: Recorded, inplace: bool = False) -> Recorded:
     if inplace:
         raise NoProgramError("a ReLU in place is no instruction")
-    return _applied(RELU, x)
-
-
-def _applied(function: int, x: Recorded) -> Recorded:
-    order = x.made().order()
-    found = x.writer.program.apply(function, x.writer.dense(x, order))
-    return x.writer.filled(found, inverse(order))
+    return _applied(x, x.writer.program.apply, RELU)
 
 
 @lowers(distances)
 def _(x: Recorded, typical: float) -> Recorded:
+    return _applied(x, x.writer.program.distance, typical)
+
+
+def _applied(x: Recorded, write: Callable[[Slot, Any], Slot], argument: Any) -> Recorded:
+    """The result of an instruction that takes each number for itself."""
     order = x.made().order()
-    found = x.writer.program.distance(x.writer.dense(x, order), typical)
-    return x.writer.filled(found, inverse(order))
+    return x.writer.filled(write(x.writer.dense(x, order), argument), inverse(order))
 
 
 @lowers(torch.cat)

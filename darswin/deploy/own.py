@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.overrides import handle_torch_function, has_torch_function_unary
 
 import darswin.ops  # noqa: F401  (it registers our operators)
-from darswin.layers.quantized import Quantization, quantized_layers
+from darswin.layers.quantized import quantized_layers
 from darswin.ops import _module
 
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -29,16 +29,11 @@ _PACK = own_operator("_pack_linear")
 _LINEAR = own_operator("_linear")
 
 
-def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
-    """The quantization of what the layer with this name takes; None if it is not quantized."""
-    return quantized_layers(module).get(name)
-
-
 def packed_weights(linear: Any) -> Tensor:
     """A linear layer as `_linear` reads it, (K,): float32, or int32 if quantized."""
     weight = linear.weight.detach()
     bias = None if linear.bias is None else linear.bias.detach().float()
-    if (taken := taken_by(linear)) is not None:
+    if (taken := quantized_layers(linear).get("")) is not None:
         return _PACK(weight, bias, linear.weight_scale.float(), *taken)
     return _PACK(weight.float(), bias)
 

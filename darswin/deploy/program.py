@@ -19,6 +19,7 @@ _NETWORK, _FORGET, _RUN = map(own_operator, ("_network", "_forget_network", "_ru
  POOL) = range(13)  # fmt: skip
 NOTHING, GELU, RELU = range(3)  # what follows a product
 COPY_AXES = 5
+Axes = Sequence[tuple[int, int, int]]  # sizes, and the strides of reading and of writing
 
 
 class NoProgramError(Exception):
@@ -145,7 +146,7 @@ class Program:
     def output(self, slot: Slot) -> None:
         """Makes the numbers of a slot the next output, in its shape."""
         if not slot.is_buffer or slot.key in {output.key for output in self._outputs}:
-            slot = self.permuted(slot, slot.shape, range(len(slot.shape)), *slot.shape)
+            slot = self.copy(slot, self.buffer(*slot.shape), [(slot.numbers, 1, 1)])
         self._outputs.append(slot)
 
     def checked(self) -> Checked:
@@ -240,27 +241,11 @@ class Program:
             base = None
         return out
 
-    def copy(
-        self,
-        x: Slot,
-        out: Slot,
-        sizes: Sequence[int],
-        reads: Sequence[int],
-        writes: Sequence[int],
-        to: int = 0,
-        begin: int = 0,
-    ) -> Slot:
-        """Copies an array of up to five axes between places with these strides; `begin` and `to`
-        are where reading and writing begin."""
-        self._steps.append(_copy(x, out, list(zip(sizes, reads, writes, strict=True)), begin, to))
+    def copy(self, x: Slot, out: Slot, axes: Axes, begin: int = 0, to: int = 0) -> Slot:
+        """Copies an array of up to five axes; `begin` and `to` are where reading and writing
+        begin."""
+        self._steps.append(_copy(x, out, axes, begin, to))
         return out
-
-    def permuted(self, x: Slot, sizes: Sequence[int], order: Sequence[int], *shape: int) -> Slot:
-        """The axes of x, which has these sizes, in another order, as a new buffer of a shape."""
-        reads, moved = _strides(sizes), [sizes[axis] for axis in order]
-        return self.copy(
-            x, self.buffer(*shape), moved, [reads[axis] for axis in order], _strides(moved)
-        )
 
     def added(self, x: Slot, y: Slot) -> Slot:
         """The sum of two slots."""
@@ -272,7 +257,7 @@ class Program:
         out = self.buffer(x.shape[-1])
         return self._step(MEAN, out, [x], x, out, x.rows, x.shape[-1])
 
-    def apply(self, function: int, x: Slot) -> Slot:
+    def apply(self, x: Slot, function: int) -> Slot:
         """The GELU or the ReLU."""
         out = self.buffer(*x.shape)
         return self._step(APPLY, out, [x], out, function, base=x)
@@ -316,19 +301,10 @@ class Program:
         return self._step(DISTANCE, out, [x], out, *bits, base=x)
 
 
-def _copy(
-    x: Slot, out: Slot, axes: Sequence[tuple[int, int, int]], begin: int = 0, to: int = 0
-) -> Step:
-    """The step of `Program.copy`; axes: their size, and the strides of reading and writing."""
+def _copy(x: Slot, out: Slot, axes: Axes, begin: int = 0, to: int = 0) -> Step:
+    """The step of `Program.copy`."""
     if len(axes) > COPY_AXES:
         raise NoProgramError(f"a copy with {len(axes)} axes is no instruction")
     padded = [(1, 0, 0)] * (COPY_AXES - len(axes)) + list(axes)
     places = chain.from_iterable(zip(*padded, strict=True))
     return Step(COPY, out, [x], (x, out, begin, to, *places))
-
-
-def _strides(sizes: Sequence[int]) -> list[int]:
-    strides = [1]
-    for size in reversed(sizes[1:]):
-        strides.insert(0, strides[0] * size)
-    return strides

@@ -4,6 +4,7 @@ import copy
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Generic, TypeVar
 
 import torch
@@ -224,19 +225,16 @@ def _observed(
     ends: dict[str, list[Tensor]] = defaultdict(list)
     chance = torch.Generator().manual_seed(0)
 
-    def keeper(name):
-        def keep(module, arguments):
-            values = arguments[0].detach().float().flatten()
-            if values.numel():
-                # Drawn at random: a fixed step would meet the same few channels.
-                drawn = torch.randint(values.numel(), (_KEPT,), generator=chance)
-                kept[name].append(values[drawn])
-                ends[name].extend(values.aminmax())
-
-        return keep
+    def keep(name, module, arguments):
+        values = arguments[0].detach().float().flatten()
+        if values.numel():
+            # Drawn at random: a fixed step would meet the same few channels.
+            drawn = torch.randint(values.numel(), (_KEPT,), generator=chance)
+            kept[name].append(values[drawn])
+            ends[name].extend(values.aminmax())
 
     layers = dict(model.named_modules())
-    hooks = [layers[name].register_forward_pre_hook(keeper(name)) for name in names]
+    hooks = [layers[name].register_forward_pre_hook(partial(keep, name)) for name in names]
     results = []
     try:
         with Progress("running the model on the pictures", len(batches)) as progress:

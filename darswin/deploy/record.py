@@ -260,10 +260,9 @@ class Trace:
             if merged and merged[-1][1:] == (read * size, write * size):
                 size *= merged.pop()[0]
             merged.append((size, read, write))
-        sizes, reads, writes = zip(*(merged or [(1, 1, 1)]), strict=True)
         assert target.slot is not None
-        places = int(to.storage_offset()), int(meta.storage_offset())
-        self.program.copy(x, target.slot, sizes, reads, writes, *places)
+        places = int(meta.storage_offset()), int(to.storage_offset())
+        self.program.copy(x, target.slot, merged or [(1, 1, 1)], *places)
 
     def by_rows(self, x: Recorded, width: int, write: Callable[[Slot], Slot]) -> Recorded:
         """What an instruction makes of the last axis. The rows keep their order in memory."""

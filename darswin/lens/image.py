@@ -51,7 +51,9 @@ class LensInImage(LensBatch):
 
     def through_affine(self, flat: Tensor) -> Tensor:
         """`affine` @ points or offsets (N or 1, ..., 2)."""
-        return flat if self.affine is None else _apply(self.affine, flat)
+        if self.affine is None:
+            return flat
+        return (self._row(self.affine, flat.dim() + 1) @ flat[..., None])[..., 0]
 
     def resized(self, scale: float | Tensor | Sequence[int]) -> Self:
         """The same lens for an image resized like `cv2.resize` does.
@@ -157,8 +159,3 @@ def _image_size(size: Any) -> tuple[int, int]:
     if height < 1 or width < 1:
         raise ValueError(f"an image's (H, W) must be at least (1, 1), got {(height, width)}")
     return height, width
-
-
-def _apply(matrix: Tensor, points: Tensor) -> Tensor:
-    """(N, 2, 2) @ (N or 1, ..., 2)."""
-    return (LensBatch._row(matrix, points.dim() + 1) @ points[..., None])[..., 0]

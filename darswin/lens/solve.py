@@ -63,7 +63,9 @@ def repeated(
     """The state after calls of `step(*state)`, which end after `rounds` or when `going(*state)` is
     true nowhere. An exported graph has one loop for it, if torch can write that."""
     if _HAS_LOOPS and torch.compiler.is_exporting():
-        start = torch.zeros((), dtype=torch.int64, device=state[0].device), *map(_dense, state)
+        # The state of a loop keeps its strides.
+        dense = (x.clone(memory_format=torch.contiguous_format) for x in state)
+        start = torch.zeros((), dtype=torch.int64, device=state[0].device), *dense
         return while_loop(
             lambda count, *state: (count < rounds) & going(*state).any(),
             lambda count, *state: (count + 1, *step(*state)),
@@ -80,11 +82,6 @@ def repeated(
 def _stops(value: Tensor) -> bool:
     """Whether the number of steps may depend on values."""
     return readable(value) and not transformed()
-
-
-def _dense(x: Tensor) -> Tensor:
-    """A copy in C order: the state of a loop keeps its strides."""
-    return x.clone(memory_format=torch.contiguous_format)
 
 
 def _brackets(function: Function, value: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -86,9 +86,7 @@ class Model(nn.Module, Generic[Result]):
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Result:
         """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
-        images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared.view, self.dtype)
-        return self.forward_network(x, prepared, images)
+        return self.forward_network(*self._seen(images, lens))
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """Everything that depends on the lens but not on the pixels, for any number of `run` calls.
@@ -234,10 +232,12 @@ class Model(nn.Module, Generic[Result]):
                 )
         return self.view.normalized(images, self.dtype)
 
-    def _checked_and_prepared(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Prepared]:
+    def _seen(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Prepared, Tensor]:
+        """The arguments of `forward_network`."""
         images = self._checked(images)
         height, width = images.shape[2:]
-        return images, self.prepare(lens, (height, width))
+        prepared = self.prepare(lens, (height, width))
+        return self.view.see(images, prepared.view, self.dtype), prepared, images
 
     def _checked(self, images: Tensor) -> Tensor:
         """The images as (B, C, H, W), after a check of their channels, size, device and dtype.

@@ -171,8 +171,7 @@ class Encoder(Model[Tensor]):
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map after the norm."""
-        images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared.view, self.dtype)
+        x, prepared, _ = self._seen(images, lens)
         return self.norm(self.maps(x, prepared.tables)[-1])
 
     def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
@@ -210,8 +209,7 @@ class Encoder(Model[Tensor]):
         """
         taken = take_indices(len(self.stages), indices)
         _check_format(output_fmt)
-        images, prepared = self._checked_and_prepared(images, lens)
-        x = self.view.see(images, prepared.view, self.dtype)
+        x, prepared, _ = self._seen(images, lens)
         maps = self.maps(x, prepared.tables, count=max(taken) + 1 if stop_early else None)
         final = maps[-1]
         if len(maps) == len(self.stages) and (norm or not intermediates_only):

@@ -13,7 +13,6 @@ from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
-from darswin.data.framing import CutOff
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
@@ -33,7 +32,7 @@ SamplesT = TypeVar("SamplesT", bound=Samples)
 
 
 class RunData(LightningDataModule):
-    """Base of the data of a run. Subclasses define `_open`, `test_names`, `dataset`, `_training`.
+    """Base of the data of a run. Subclasses define `_open`, `test_names` and `dataset`.
 
     Args:
         path: the data set that `open_source` or `open_scenes` opens.
@@ -80,6 +79,7 @@ class RunData(LightningDataModule):
     card_fit: Fit
     colors: Sequence[Sequence[int]] = []
     pair_lenses = False  # True if the two images of a mixture share a lens
+    _more_augmentation: dict[str, Any]  # the options of a subclass for the training split
 
     def __init__(
         self,
@@ -213,7 +213,7 @@ class RunData(LightningDataModule):
         self.datasets.append(dataset)
         if not self._said_cut_off and not self._place["rank"] and (lost := dataset.cut_off()):
             self._said_cut_off = True
-            said = CutOff(f"`fit` crop cuts off {lost}; `fit` stretch keeps it")
+            said = UserWarning(f"`fit` crop cuts off {lost}; `fit` stretch keeps it")
             warnings.warn(naming(said, "fit"), stacklevel=2)
         return dataset
 
@@ -239,7 +239,10 @@ class RunData(LightningDataModule):
 
     def _training(self) -> Samples:
         """The training split, augmented."""
-        raise NotImplementedError
+        return self.dataset(
+            "train", turns=self.turns, lens_augmentation=self.lens_augmentation,
+            augment=self.colour_changes, **self._more_augmentation,
+        )  # fmt: skip
 
     def check(self, splits: Sequence[Split]) -> None:
         """Raises one error for all files of these splits that a training could not use."""
@@ -275,8 +278,8 @@ class RunData(LightningDataModule):
         """Images, lenses and targets on the device; copies to a GPU do not block."""
         return [part.to(device, non_blocking=device.type == "cuda") for part in batch]
 
-    def dataset(self, split: Split, name: str | None = None) -> Samples:
-        """A split without augmentation; `name` is one of `test_names`."""
+    def dataset(self, split: Split, name: str | None = None, **options: Any) -> Samples:
+        """A split with options, those of augmentation; `name` is one of `test_names`."""
         raise NotImplementedError
 
     def _evaluation(self, split: Split, name: str | None = None) -> DataLoader:
@@ -343,7 +346,8 @@ class WideAngleData(RunData):
         )
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
         self.card_fit = self.fit if self._lens else "whole"
-        self.erasing, self.pair_lenses = erasing, pair_lenses
+        self.pair_lenses = pair_lenses
+        self._more_augmentation = dict(erase=RandomErasing(erasing) if erasing else None)
 
     @property
     def fit(self) -> Fit:
@@ -375,10 +379,3 @@ class WideAngleData(RunData):
             return self._noted(Calibrated(source, self.calibrations, **self._form, **options))
         lenses = self.train_lenses if name is None else parse_lenses(name)
         return self._noted(WideAngle(source, lenses, **self._warping, **self._form, **options))
-
-    def _training(self) -> Samples:
-        erase = RandomErasing(self.erasing) if self.erasing else None
-        return self.dataset(
-            "train", turns=self.turns, lens_augmentation=self.lens_augmentation,
-            augment=self.colour_changes, erase=erase,
-        )  # fmt: skip

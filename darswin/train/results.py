@@ -119,7 +119,8 @@ def _text(rows: Table) -> str:
 
 def _no_better(rows: Table) -> str | None:
     """A sentence on the test sets whose interval does not exclude always giving one answer."""
-    found = [row["lenses"] for row in rows if row.get("n") and _is_no_better(row)]
+    tested = [row for row in rows if row.get("n") and "most_frequent" in row]
+    found = [row["lenses"] for row in tested if row["top1_low"] <= row["most_frequent"]]
     if not found:
         return None
     where = "any test set" if len(found) == len(rows) else ", ".join(found)
@@ -127,10 +128,6 @@ def _no_better(rows: Table) -> str | None:
         f"On {where}, the accuracy is not certainly above that of always answering the most "
         "frequent class."
     )
-
-
-def _is_no_better(row: dict[str, Any]) -> bool:
-    return "most_frequent" in row and row["top1_low"] <= row["most_frequent"]
 
 
 def _title(key: str) -> str:

@@ -41,7 +41,7 @@ class SceneData(RunData):
         super().__init__(path, batch_size=batch_size, **common)
         self.card_fit = self.fit
         self.test_paths = test_paths or []
-        self.crop = crop
+        self._more_augmentation = dict(crop=crop)
 
     def _open(self, split: Split, channels: int | None) -> Scenes:
         scenes = open_scenes(
@@ -88,9 +88,3 @@ class SceneData(RunData):
         else:
             scenes = self.source(split)
         return self._noted(SceneSamples(self._limited(scenes), **self._form, **options))
-
-    def _training(self) -> SceneSamples:
-        return self.dataset(
-            "train", turns=self.turns, crop=self.crop, lens_augmentation=self.lens_augmentation,
-            augment=self.colour_changes,
-        )  # fmt: skip

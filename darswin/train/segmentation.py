@@ -114,10 +114,6 @@ def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
     return ratio(right, present + confusion.sum(0) - right), ratio(right, present)
 
 
-class AbsentClass(UserWarning):
-    """A class does not occur in the labels that a model is trained on."""
-
-
 class Segmentation(PixelModule):
     """Predicts a class for each pixel of wide-angle images; measures mIoU, accuracy and IoU.
 
@@ -217,7 +213,7 @@ class Segmentation(PixelModule):
             )
             raise naming(ValueError(text), "label_map")
         if not self.global_rank:
-            warnings.warn(f"{text}, which cannot be learned", AbsentClass, stacklevel=2)
+            warnings.warn(f"{text}, which cannot be learned", stacklevel=2)
 
     def _per_class(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
         iou, recall = iou_and_recall(counts)

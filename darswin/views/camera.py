@@ -108,10 +108,7 @@ class CameraView(PixelView):
     def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
         if not self.lens.is_radial:
             return super().points_read(lens, size)
-        supersampling = self.supersampling_of(lens, size)
-        return self._points(
-            lens, size, *(centres(side, supersampling * side) for side in self.size)
-        )
+        return self._points(lens, size, *centres(self, lens, size))
 
     def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
         if not self.lens.is_radial:
@@ -192,9 +189,10 @@ def picture_size(lens: Lens) -> Pair:
     return round(height), round(width)
 
 
-def centres(size: int, count: int) -> np.ndarray:
-    """`count` equally spaced points of a side, (count,)."""
-    return (np.arange(count) + 0.5) * (size / count) - 0.5
+def centres(view: PixelView, lens: Lens, size: Pair) -> list[np.ndarray]:
+    """y and x of the points of a view at which it reads images of (H, W)."""
+    each = view.supersampling_of(lens, size)
+    return [(np.arange(each * side) + 0.5) * (1 / each) - 0.5 for side in view.size or size]
 
 
 def flat_points(lens: Lens, size: Any, y: np.ndarray, x: np.ndarray, turn: np.ndarray) -> list:

@@ -141,10 +141,7 @@ class CropView(PixelView):
         return np.ascontiguousarray(resized).reshape(*self.size, *picture.shape[2:])
 
     def points_read(self, lens: Lens, size: Pair) -> np.ndarray:
-        supersampling = self.supersampling_of(lens, size)
-        return self._points(
-            lens, size, *(centres(side, supersampling * side) for side in self.size)
-        )
+        return self._points(lens, size, *centres(self, lens, size))
 
     def points_of_target(self, lens: Lens, size: Pair) -> np.ndarray:
         points = self._points(lens, size, *map(np.arange, self.size))

@@ -31,7 +31,7 @@ from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
 from darswin.utils.arrays import as_tensor
 from darswin.utils.files import replace_file
-from darswin.views import PixelView, PolarGrid, PolarView
+from darswin.views import PixelView, PolarView
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
 
 __all__ = ["draw_lens", "save_figure"]
@@ -110,35 +110,29 @@ def draw_grid(
     Affine, tangential and thin-prism terms of the lens deform the rings. The sampler of a model is
     `model.view`.
     """
-    lens, grid = _grid(lens, sampler, image)
-    _show(axes, image)
-    _draw_borders(axes, lens, sampler, image.shape[:2], (0.6, 0.3))
+    x, y = _draw_partition(image, lens, sampler, (0.6, 0.3), axes)
     if samples:
-        axes.plot(*_sample_pixels(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
+        axes.plot(x, y, "r.", ms=0.6, alpha=0.5)
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
 
 
 def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes) -> None:
     """Draws the grid on a tenth of the image, enlarged. The part lies half way between the centre
     and the upper right end of the lens, if the image reaches there."""
-    lens, grid = _grid(lens, sampler, image)
     left, top, width, height = _enlarged(image, lens)
-    _show(axes, image)
-    _draw_borders(axes, lens, sampler, image.shape[:2], (1.2, 1.2))
-    x, y = _sample_pixels(lens, grid, image.shape[:2])
+    x, y = _draw_partition(image, lens, sampler, (1.2, 1.2), axes)
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
     axes.plot(x[inside], y[inside], "r.", ms=1.5, path_effects=_outline(0.3, "white"))
     axes.set(xlim=(left, left + width), ylim=(top + height, top))
 
 
-def _draw_borders(
-    axes: Axes,
-    lens: Lens,
-    sampler: PolarView,
-    size: tuple[int, int],
-    widths: tuple[float, float],
-) -> None:
-    """Draws rings and sectors with an outline, which keeps them visible on bright pictures."""
+def _draw_partition(
+    image: np.ndarray, lens: Lens, sampler: PolarView, widths: tuple[float, float], axes: Axes
+) -> Tensor:
+    """Draws an image with rings and sectors, whose outlines keep them visible where it is bright.
+    Returns x and y of the sample points, (2, n) px."""
+    lens, size = _one(lens), image.shape[:2]
+    _show(axes, image)
     # Rings beyond θ_max of the lens, of a fixed theta_max, are drawn at its rim.
     rings = sampler.border_angles(lens)[0].clamp(max=lens.theta_max)[:, None]
     around = torch.linspace(0, 2 * math.pi, 361)
@@ -149,10 +143,7 @@ def _draw_borders(
         effects = _outline(width, "black")
         collection = LineCollection(list(lines), colors="cyan", lw=width, path_effects=effects)
         axes.add_collection(collection, autolim=False)
-
-
-def _sample_pixels(lens: Lens, grid: PolarGrid, size: tuple[int, int]) -> Tensor:
-    """The x and y of the sample points, (2, n) px."""
+    grid = sampler.grid(lens, size)
     theta = lens.unproject(grid.radii[0])[:, None]
     return lens.project_rays(theta, grid.azimuths, size).flatten(0, 1).T
 
@@ -164,10 +155,11 @@ def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
 
 def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes) -> None:
     """Draws the polar image, without jitter: rows are radii, columns are azimuths."""
-    lens, grid = _grid(lens, sampler, image)
+    lens = _one(lens)
     pixels = as_tensor(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
     # The last channel is the fraction of a sample that lies in the image.
     pixels = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
+    grid = sampler.grid(lens, image.shape[:2])
     arguments = sampler.arguments(pixels, grid) | dict(jitter=0.0)
     *colours, share = polar_sample(**arguments, layout="image")[0].numpy()
     rows, scale = len(share), 255 if image.dtype == np.uint8 else 1
@@ -373,11 +365,6 @@ def _one(lens: Lens) -> Lens:
     if len(lens) != 1:
         raise ValueError(f"a figure shows one lens, got {len(lens)}")
     return lens.detach().to("cpu", torch.float64)
-
-
-def _grid(lens: Lens, sampler: PolarView, image: np.ndarray) -> tuple[Lens, PolarGrid]:
-    lens = _one(lens)
-    return lens, sampler.grid(lens, image.shape[:2])
 
 
 def _enlarged(image: np.ndarray, lens: Lens) -> tuple[float, float, float, float]:

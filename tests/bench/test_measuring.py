@@ -7,6 +7,7 @@ import model
 import peers
 import pytest
 import torch
+from helpers import refused
 from kit import candidates, memory, start, tables, timing
 from kit.record import Record
 from kit.start import Start
@@ -171,8 +172,7 @@ def test_candidates_that_disagree_are_not_timed():
     compare(lambda x, y: double(x, y)[None], view=lambda result: result.reshape(4))
     runs = {OURS: lambda: torch.ones(3), REFERENCE: lambda: torch.ones(3) + 1e-3}
     model._check(runs | {MATMULS: lambda: torch.zeros(1)}, 1e-2)
-    with pytest.raises(RuntimeError, match="darswin differs from the reference"):
-        model._check(runs, 1e-4)
+    refused("darswin differs from the reference", model._check, runs, 1e-4, error=RuntimeError)
 
 
 def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, camera, monkeypatch):
@@ -208,8 +208,7 @@ def test_the_benchmark_of_models(tmp_path, capsys, monkeypatch):
         assert found >= {OURS, REFERENCE, MATMULS} | fixed, mode
     assert OURS_FLOAT32 in names["inference, int8", 1]
     assert tables.models_table(record.timings) in capsys.readouterr().out
-    with pytest.raises(ValueError, match="`batches` must be from 1 to 65536, got -1"):
-        model.bench(batches=[-1], out=tmp_path)
+    refused("`batches` must be from 1 to 65536, got -1", model.bench, batches=[-1], out=tmp_path)
 
 
 def test_the_fastest_has_the_shortest_call_but_the_first_of_each(monkeypatch):

@@ -289,8 +289,7 @@ def test_a_record_of_another_program_is_not_replaced(tmp_path):
 def test_more_classes_than_a_png_holds_are_refused(stub, labels):
     stub("segmentation").num_classes = 256
     write("p.png", picture_of(labels))
-    with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
-        predict("p.png")
+    refused("at most 255 classes, got 256", predict, "p.png", error=SystemExit)
 
 
 def test_a_real_model_answers_as_in_python(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 from typing import Literal
 
 import pytest
+from helpers import ended
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -74,10 +75,8 @@ def test_a_function_gets_its_arguments(capsys):
     assert all(type(number) is float for number in (*numbers["shares"], *numbers["up"]))
     given = ("s", "--count", "3", "--rate", "2", "--kind", "null", "--out", "null", "--names")
     assert command_of(*given) == usual | dict(rate=2.0, names=[], out=None)
-    with pytest.raises(SystemExit) as end:
-        command_of("--help")
-    text = " ".join(capsys.readouterr().out.split())
-    assert end.value.code == 0 and "Does nothing." in text and "of 100% of things." in text
+    text = " ".join(ended(capsys, 0, command_of, "--help").out.split())
+    assert "Does nothing." in text and "of 100% of things." in text
     assert "of it. One of a, b." in text and "[1,2]" in text and "[0.5]" in text
 
 
@@ -100,10 +99,7 @@ def test_a_function_gets_its_arguments(capsys):
     ],
 )
 def test_wrong_arguments_are_one_sentence(capsys, typed, said):
-    with pytest.raises(SystemExit) as end:
-        command_of(*typed.split())
-    assert end.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = ended(capsys, 2, command_of, *typed.split()).err.splitlines()
     assert line.startswith(f"prog: {said}") and line.endswith("; see `prog --help`")
 
 
@@ -134,9 +130,7 @@ def test_help_describes_every_argument_in_sentences(capsys, monkeypatch, name):
     command, part = [*name.split(), ""][:2]
     function = resolve_name(COMMANDS[command].function)
     function = function[part] if isinstance(function, dict) else function
-    with pytest.raises(SystemExit):
-        main([*name.split(), "--help"])
-    text = capsys.readouterr().out
+    text = ended(capsys, 0, main, [*name.split(), "--help"]).out
     assert text.splitlines()[2].endswith(".")
     for argument in inspect.signature(function).parameters:
         (described,) = re.findall(rf"^  (?:--)?{argument}\b(?: [A-Z_[\]]+)?\s+(.+)", text, re.M)

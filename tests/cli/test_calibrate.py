@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from calibrate_boards import Renderer
-from helpers import slow_but
+from helpers import ended, slow_but
 from PIL import ExifTags, Image
 
 from darswin import lens
@@ -55,10 +55,8 @@ def calibrate(*arguments) -> None:
 
 def refusal(capsys, *arguments) -> str:
     """The line with which the command refuses, with exit code 2."""
-    with pytest.raises(SystemExit) as end:
-        calibrate(*arguments)
-    printed = capsys.readouterr()
-    assert end.value.code == 2 and not printed.out
+    printed = ended(capsys, 2, calibrate, *arguments)
+    assert not printed.out
     return printed.err.splitlines()[-1]  # after signs of life, on a slow machine
 
 
@@ -126,10 +124,8 @@ def test_a_folder_as_people_have_it(folder, capsys, monkeypatch, orientation):
     draw = "darswin.viz.calibration.draw_calibration"
     monkeypatch.setattr(draw, lambda *given: drawn.append(given) or Figure((1, 1)))
     options = ("--picture=made.png", "--report=report.json", "--theta_max_deg=80")
-    with pytest.raises(SystemExit) as end:
-        calibrate("boards", "boards/5.png", *BOARD, *options)
-    printed = capsys.readouterr()
-    assert end.value.code == 2 and re.search("pictures        [89] of 9", printed.out)
+    printed = ended(capsys, 2, calibrate, "boards", "boards/5.png", *BOARD, *options)
+    assert re.search("pictures        [89] of 9", printed.out)
     assert re.search("(blurred|no board found).*boards/7.png", printed.out)
     assert "boards/copy.png shows the same as boards/2.png, and is left out" in printed.out
     assert "boards/5.png shows the same as boards/5.png, and is left out" in printed.out
@@ -172,10 +168,8 @@ def test_the_ratio_of_pixels_that_are_not_square_is_kept(folder, capsys, out):
 
 
 def test_a_lens_that_the_format_cannot_hold_is_written_as_json(folder, capsys):
-    with pytest.raises(SystemExit) as end:
-        calibrate("boards", *BOARD, "--model=OCam", "--out=made.yaml")
-    printed = capsys.readouterr()
-    assert end.value.code == 2 and "made.yaml.json: darswin, OCam" in printed.out
+    printed = ended(capsys, 2, calibrate, "boards", *BOARD, "--model=OCam", "--out=made.yaml")
+    assert "made.yaml.json: darswin, OCam" in printed.out
     assert "cannot hold this OCam lens" in printed.err and "is in made.yaml.json" in printed.err
     assert isinstance(lens.load("made.yaml.json"), lens.OCam)
 

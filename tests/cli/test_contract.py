@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import ended
 from PIL import ExifTags, Image
 from videos import turn_video, write_video
 
@@ -95,10 +96,7 @@ class Run:
     def fails(self, capsys) -> str:
         """What the command says when it ends with exit code 2."""
         capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            self()
-        assert end.value.code == 2
-        return capsys.readouterr().err
+        return ended(capsys, 2, self).err
 
     def results(self) -> dict[str, np.ndarray]:
         if self.command in ("undistort", "warp"):
@@ -278,10 +276,8 @@ def test_a_full_disk_leaves_old_files_and_no_halves(run, command, capsys, monkey
         before.pop(str(next(Path("out/images").iterdir())))
         next(Path("out/images").iterdir()).unlink()
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(SystemExit) as end:
-        main((COMMANDS | WRITERS)[command].split())
-    assert end.value.code == 2
-    assert "cannot write the file, which is unchanged: No space left" in capsys.readouterr().err
+    printed = ended(capsys, 2, main, (COMMANDS | WRITERS)[command].split())
+    assert "cannot write the file, which is unchanged: No space left" in printed.err
     after = state_of("out", "old.json", "old.png")
     assert after == {name: before[name] for name in after}  # a lens.json may be gone
     assert len(before) - len(after) <= 1
@@ -336,8 +332,6 @@ def test_what_is_no_file_is_refused_at_once(run, capsys, kind, monkeypatch):
         ("lens calibrate f.png --board 6x5 --square 1", "f.png"),
         ("fit --run r --data.path digits --data.lens f.json", ""),  # it follows links
     ):
-        with pytest.raises(SystemExit) as end:
-            main(command.split())
-        printed = capsys.readouterr()
-        assert end.value.code == 2 and not printed.out
+        printed = ended(capsys, 2, main, command.split())
+        assert not printed.out
         assert f"{name} must be a file, but is {kind}" in printed.err

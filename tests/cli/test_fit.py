@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers import ended
 from runs import QUIET, error, fit
 from scenes import write_plain
 
@@ -172,13 +173,6 @@ def test_every_preset_trains(preset, tmp_path, scenes):
 # -- help -------------------------------------------------------------------------------------
 
 
-def shown(capsys, *argv):
-    with pytest.raises(SystemExit) as end:
-        main(list(argv))
-    assert end.value.code == 0
-    return capsys.readouterr().out
-
-
 def options_in(text):
     return re.findall(r"^  (?:-c, |-c CONFIG, )?--([\w.]+)", text, re.M)
 
@@ -196,7 +190,7 @@ def own(task):
 
 @pytest.mark.parametrize("task", get_args(Task))
 def test_our_options_come_first_and_none_is_missing(capsys, task):
-    text = shown(capsys, "fit", "--task", task, "--help")
+    text = ended(capsys, 0, main, ["fit", "--task", task, "--help"]).out
     lines, names = text.splitlines(), options_in(text)
     assert len(lines) <= 150 and max(map(len, lines)) < 120
     assert names[:3] == ["config", "run", "resume"] and len(set(names)) == len(names)
@@ -217,7 +211,7 @@ def test_our_options_come_first_and_none_is_missing(capsys, task):
 def test_all_has_everything(capsys):
     from lightning.pytorch import Trainer
 
-    texts = [shown(capsys, "test", flag) for flag in ("--help", "--help.all")]
+    texts = [ended(capsys, 0, main, ["test", flag]).out for flag in ("--help", "--help.all")]
     few, every = map(options_in, texts)
     assert texts[0].startswith("usage: darswin test --run RUN [options]")
     assert "have no effect [from the run]" in " ".join(texts[0].split())

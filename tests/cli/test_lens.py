@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import slow_but
+from helpers import ended, slow_but
 from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import FILES, FRONT
@@ -243,6 +243,4 @@ def test_errors_show_names_of_files_as_they_are(capsys):
         (["lens", "crop", str(folder / "two.yaml"), "o", "--size", "9,9"],
          "two.yaml: it has several cameras, choose one with --camera: 'cam0'"),
     ):  # fmt: skip
-        with pytest.raises(SystemExit):
-            main(argv)
-        assert said in capsys.readouterr().err
+        assert said in ended(capsys, 2, main, argv).err

@@ -288,8 +288,7 @@ def test_what_a_network_needs(disc, monkeypatch):
             predict(f"p.png --network n.onnx --view none {known}")
         assert Path("out/predictions.json").read_text() == "[]"
     monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")
-    with pytest.raises(SystemExit, match="onnxruntime missing"):
-        predict("p.png --network n.onnx")
+    refused("onnxruntime missing", predict, "p.png --network n.onnx", error=SystemExit)
 
 
 @pytest.mark.parametrize(
@@ -305,8 +304,7 @@ def test_what_was_found_before_an_error_is_kept(disc, outputs, options, said):
     Path("p.png").rename("in/b.png")
     Path("names.txt").write_text("red\n")
     write_graph(Path("n.onnx"), outputs, size=(256, 256))
-    with pytest.raises(SystemExit, match=said):
-        predict(f"in --network n.onnx --view tiles:5 {options}")
+    refused(said, predict, f"in --network n.onnx --view tiles:5 {options}", error=SystemExit)
     (found,) = json.loads(Path("out/predictions.json").read_text())
     assert found["image"] == "in/a.png" and found["detections"] == []
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import fixture
+from helpers import fixture, refused
 from scenes import write_plain
 from videos import write_video
 
@@ -95,8 +95,7 @@ def test_the_lenses_of_files(run, monkeypatch):
         lenses = given_lenses(*options, files)
         for file, lens in zip(files, expected, strict=True):
             if lens is None:
-                with pytest.raises(ValueError, match=f"{file} has no lens"):
-                    lenses[file].lens_of(file, SIZE)
+                refused(f"{file} has no lens", lenses[file].lens_of, file, SIZE)
             else:
                 found = lenses[file].lens_of(file, SIZE)
                 assert str(found) == str(in_upright_picture(lens, SIZE, 1))
@@ -148,8 +147,7 @@ def test_weights_of_the_released_model(tmp_path, capsys):
     torch.save({"model": {"a": torch.ones(2)}}, tmp_path / "other.pth")
     main(["convert", str(tmp_path / "other.pth"), str(tmp_path / "other.safetensors")])
     said = "not the name of their model, and are not a state dict.*LensAdapter, runs in Python"
-    with pytest.raises(SystemExit, match=said):
-        main([*argv, "--model", str(tmp_path / "other.safetensors")])
+    refused(said, main, [*argv, "--model", str(tmp_path / "other.safetensors")], error=SystemExit)
 
 
 def test_the_first_prediction(capsys):

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import slow_but
+from helpers import ended, slow_but
 from PIL import Image
-from scenes import write_woodscape
+from scenes import drawn, write_woodscape
 
 from darswin import lens as lenses
 from darswin.boxes import decode_rle, encode_rle, iou
@@ -42,10 +42,7 @@ def warp(source, to, options="", out="out", lens=FLAT):
 
 def refused(capsys, *arguments, **options):
     """What the command says when it ends with exit code 2."""
-    with pytest.raises(SystemExit) as error:
-        warp(*arguments, **options)
-    assert error.value.code == 2
-    return capsys.readouterr().err.strip()
+    return ended(capsys, 2, warp, *arguments, **options).err.strip()
 
 
 def blob(rng):
@@ -53,12 +50,6 @@ def blob(rng):
     radius = 1 + 0.2 * np.cos(3 * angle + rng.uniform(0, 7)) + 0.1 * np.cos(2 * angle)
     shape = radius[:, None] * np.stack((np.cos(angle), np.sin(angle)), -1)
     return rng.uniform(0.25, 0.75, 2) * SIZE[::-1] + rng.uniform(20, 60) * shape
-
-
-def drawn(polygons, size, fine=4):
-    points = [np.round((p * fine - 0.5) * 16).astype(np.int32) for p in polygons]
-    mask = cv2.fillPoly(np.zeros(np.array(size) * fine, np.uint8), points, 255, shift=4)
-    return cv2.resize(mask, size[::-1], interpolation=cv2.INTER_AREA)
 
 
 def write_set(folder, count=3, forms=("polygon", "mask", "box"), suffix=".png", seed=0):

@@ -119,8 +119,7 @@ def test_the_form_of_arrays():
 
 def test_wrong_options(tmp_path):
     for options in (dict(split="all"), dict(split="val", holdout=0.5)):
-        with pytest.raises(ValueError, match=f"`{list(options)[-1]}` must be"):
-            open_source("digits", **options)
+        refused(f"`{list(options)[-1]}` must be", open_source, "digits", **options)
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         open_source(tmp_path / "nowhere", "train")
     refused("2 images and 3 labels", Arrays, np.zeros((2, 4, 4), np.uint8), np.zeros(3), ["a"])

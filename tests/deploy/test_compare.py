@@ -264,7 +264,7 @@ def test_random_networks_are_equal_or_refused(seeds, tmp_path):
 
 def test_what_differs_is_not_used_and_named(monkeypatch):
     def wrong(x: record.Recorded, approximate="none"):
-        return _applied(RELU, x)
+        return _applied(x, x.writer.program.apply, RELU)
 
     monkeypatch.setitem(record.RULES, F.gelu, (wrong, inspect.signature(wrong)))
     model = Network([INSTRUCTIONS[0](), INSTRUCTIONS[3](), INSTRUCTIONS[0]()]).eval()

@@ -189,8 +189,7 @@ def check_samples(model, images, lenses):
     assert sampled.dtype == torch.float32
     assert_close(model.run_sampled(sampled, prepared, images), expected)
     if not model.view.uses_lens:
-        with pytest.raises(ValueError, match="takes images as they are: it needs no plan"):
-            camera.plan(model, lenses[0], size)
+        refused("takes images as they are: it needs no plan", camera.plan, model, lenses[0], size)
     elif images.shape[3] in (1, 3):  # a camera has as many channels
         sampled = model.sample(images[:1], model.prepare(lenses[0], size))
         sampler = frames.Sampler(camera.plan(model, lenses[0], size))

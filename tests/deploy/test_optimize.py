@@ -50,16 +50,14 @@ def test_a_fixed_lens_is_prepared_once_for_each_size(name, monkeypatch):
             assert relative_error(fixed(images), expected) < 1e-5
         monkeypatch.setattr(RelativeBias, "table", None)
         monkeypatch.setattr(type(lens), "project", None)
-    with pytest.raises(ValueError, match="call it without a lens"):
-        fixed(frames[0], lens)
+    refused("call it without a lens", fixed, frames[0], lens)
 
 
 def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():
     camera = LENSES[:1].replace(image_size=torch.tensor([[32.0, 32.0]]))
     fast = optimize(network("darswin_a_nano"), lens=camera)
     assert fast(torch.rand(1, 3, 32, 32)).shape == (1, 5)
-    with pytest.raises(ValueError, match=r"\(H, W\) = \(32, 32\)"):
-        fast(torch.rand(1, 3, 40, 32))
+    refused(r"\(H, W\) = \(32, 32\)", fast, torch.rand(1, 3, 40, 32))
 
 
 @torch.no_grad()
@@ -121,8 +119,7 @@ def test_what_cannot_be_optimized():
         (model, dict(lens=LENSES), ValueError, "lens must be one lens"),
         (network("darswin_a_nano").to("meta"), {}, ValueError, "got a model on meta"),
     ):
-        with pytest.raises(kind, match=message):
-            optimize(wrong, **options)
+        refused(message, optimize, wrong, error=kind, **options)
 
 
 @torch.no_grad()

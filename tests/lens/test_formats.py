@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import refused
+from helpers import ended, refused
 from lens_examples import FILES, K, file_text, flat, loads, opencv
 from PIL import Image
 from videos import write_video
@@ -252,7 +252,5 @@ def test_a_recorded_video_is_named(tmp_path):
 def test_a_file_that_is_missing(tmp_path, capsys):
     said = r"^calibration .*none\.json: there is no such file$"
     refused(said, load, tmp_path / "none.json", error=FileNotFoundError)
-    with pytest.raises(SystemExit) as end:
-        main(["lens", "info", "nofile"])
-    assert end.value.code == 2
-    assert capsys.readouterr().err == "darswin: calibration nofile: there is no such file\n"
+    printed = ended(capsys, 2, main, ["lens", "info", "nofile"])
+    assert printed.err == "darswin: calibration nofile: there is no such file\n"

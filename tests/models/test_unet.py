@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import create, network
+from helpers import create, network, refused
 
 from darswin import PolarView, create_model
 from darswin.layers.transformer import PatchMerging
@@ -271,5 +271,4 @@ def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options)
 
 
 def test_a_unet_takes_an_encoder():
-    with pytest.raises(TypeError, match="encoder must be an Encoder, got int: create_model makes"):
-        Unet(10)
+    refused("encoder must be an Encoder, got int: create_model makes", Unet, 10, error=TypeError)

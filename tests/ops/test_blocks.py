@@ -6,6 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
+from helpers import refused
 from torch import nn
 
 from darswin.deploy.own import norm_parameters, packed_weights
@@ -118,8 +119,7 @@ def test_linear_behind_a_norm():
     parameters, weights = norm_parameters(norm), packed_weights(linear)
     got = _linear(x, weights, 50, False, parameters, norm.eps)
     assert torch.equal(got, _linear(_norm(x, parameters, norm.eps), weights, 50, False))
-    with pytest.raises(RuntimeError, match="_linear"):
-        _linear(x, weights, 50, False, parameters[:, :36])
+    refused("_linear", _linear, x, weights, 50, False, parameters[:, :36], error=RuntimeError)
 
 
 def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3):
@@ -229,14 +229,11 @@ def test_wrong_arguments():
     weights, norm = packed_weights(layer(6, 4)), torch.ones(2, 6)
     x = torch.zeros(3, 6)
     for wrong in (x.double(), x[:, :5], x[:, :0], torch.zeros(())):
-        with pytest.raises(RuntimeError, match="_linear"):
-            _linear(wrong, weights, 4, False)
-        with pytest.raises(RuntimeError, match="_linear"):
-            _norm(wrong, norm, 1e-5)
+        refused("_linear", _linear, wrong, weights, 4, False, error=RuntimeError)
+        refused("_linear", _norm, wrong, norm, 1e-5, error=RuntimeError)
     for packed, columns in ((weights[1:], 4), (weights.double(), 4), (weights, 40), (weights, 0),
                             (weights, -4), (weights, 2**62)):  # fmt: skip
-        with pytest.raises(RuntimeError, match=r"_linear|too large"):
-            _linear(x, packed, columns, False)
+        refused(r"_linear|too large", _linear, x, packed, columns, False, error=RuntimeError)
 
 
 def test_blocks_that_do_not_fit():
@@ -253,8 +250,6 @@ def test_blocks_that_do_not_fit():
         for value in values:
             changed = [*words]
             changed[place - 23] = value
-            with pytest.raises(ValueError, match="the program of a network"):
-                Checked(weights, changed)
+            refused("the program of a network", Checked, weights, changed)
     for given in ([x], [x[..., :20], table], [x, table[:, :2]], [x.transpose(1, 2)[:, :1], table]):
-        with pytest.raises(RuntimeError, match="_run"):
-            run(given)
+        refused("_run", run, given, error=RuntimeError)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases import SMALL, raw_calls
+from helpers import refused
 from torch._subclasses import FakeTensorMode
 
 from darswin.ops import polar_sample, polar_to_image, use_reference, window_attention
@@ -153,8 +154,7 @@ def test_fake_tensors_are_checked_too(name):
                 k: mode.from_tensor(v) if isinstance(v, torch.Tensor) else v
                 for k, v in (valid | change).items()
             }
-            with pytest.raises(error, match=message):
-                operator(**fake)
+            refused(message, operator, error=error, **fake)
 
 
 def test_a_radius_of_zero_is_allowed():
@@ -205,5 +205,4 @@ def test_the_compiled_operator_refuses_sizes_that_do_not_fit(name):
 def test_float64_samples_are_not_rounded_by_the_operator_itself():
     operator, arguments = raw_calls(SMALL["polar_sample"](dtype=torch.float64))[0]
     arguments[11] = True
-    with pytest.raises(RuntimeError, match="float64 image are not rounded"):
-        operator(*arguments)
+    refused("float64 image are not rounded", operator, *arguments, error=RuntimeError)

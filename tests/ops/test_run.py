@@ -10,7 +10,7 @@ from multiprocessing.pool import ThreadPool
 
 import pytest
 import torch
-from helpers import network
+from helpers import network, refused
 
 from darswin import optimize
 from darswin.deploy.networks import frame_program
@@ -84,11 +84,9 @@ def test_wrong_inputs_are_refused():
         [x], [x[0], *tables], [x.double(), *tables], [x.to("meta"), *tables],
         [torch.zeros(2, *x.shape[1:]), *(torch.cat([t] * 3) for t in tables)], [],
     ):  # fmt: skip
-        with pytest.raises((RuntimeError, NotImplementedError), match="_run"):
-            run(changed)
+        refused("_run", run, changed, error=(RuntimeError, NotImplementedError))
     for changed in (weights.float(), weights[::2], weights[:-1]):
-        with pytest.raises((RuntimeError, ValueError), match="weights"):
-            Checked(changed, words)
+        refused("weights", Checked, changed, words, error=(RuntimeError, ValueError))
     assert run([x[:0], *tables])[0].shape == (0, 5)
 
 
@@ -101,13 +99,11 @@ def test_a_network_is_kept_until_its_program_ends():
     assert torch.equal(other(inputs)[0], expected[0])
     torch.ops.darswin._forget_network.default.redispatch(CPU, number)
     for wrong in (number, -1, 2**16, 2**62):
-        with pytest.raises(RuntimeError, match="there is no such network"):
-            run(inputs, wrong)
+        refused("there is no such network", run, inputs, wrong, error=RuntimeError)
         torch.ops.darswin._forget_network.default.redispatch(CPU, wrong)  # which does nothing
     taken = other._run.keywords["network"]
     del other
-    with pytest.raises(RuntimeError, match="there is no such network"):
-        run(inputs, taken)
+    refused("there is no such network", run, inputs, taken, error=RuntimeError)
 
 
 def test_networks_survive_threads_and_forks():

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from helpers import refused, slow_but
+from helpers import ended, refused, slow_but
 from lens_pictures import WOODSCAPE
 from lightning.pytorch.strategies import Strategy
 from runs import (
@@ -155,25 +155,22 @@ def test_signals_stop_a_run_after_a_step(whole, tmp_path, monkeypatch, capfd):
     for batch, number, code, given, step in cases:
         with monkeypatch.context() as patch:
             patch_batch(patch, batch, lambda self, number=number: os.kill(os.getpid(), number))
-            with pytest.raises(SystemExit) as caught:
-                fit(run, *given)
-        assert caught.value.code == code and checkpoint(run)["global_step"] == step
-        said = capfd.readouterr().err
+            said = ended(capfd, code, fit, run, *given).err
+        assert checkpoint(run)["global_step"] == step
         assert f"stopped at step {step}: `darswin fit --run '{run}' --resume` goes on" in said
     assert handlers == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
     fit(run, "--resume")
     assert_same(run, whole)
 
 
-def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
+def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, capsys):
     def twice(self):
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
 
     patch_batch(monkeypatch, 2, twice)
-    with pytest.raises(SystemExit) as caught:
-        fit(tmp_path, *DIGITS)
-    assert caught.value.code == 130 and not (tmp_path / "checkpoints").exists()
+    ended(capsys, 130, fit, tmp_path, *DIGITS)
+    assert not (tmp_path / "checkpoints").exists()
 
 
 def test_a_refused_resume_changes_nothing(whole, capsys):

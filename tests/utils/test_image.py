@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
+from pngs import chunk
 
 from darswin.utils.image import (
     BrokenImageError,
@@ -13,11 +14,6 @@ from darswin.utils.image import (
     read_oriented,
     read_stored,
 )
-
-
-def chunk(kind, data):
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
 
 # A header of 60,000 × 60,000 pixels: more than OpenCV reads.
 HUGE = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0))

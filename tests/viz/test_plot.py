@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import refused
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -58,8 +59,7 @@ def test_draw_grid_shows_borders_and_samples(lens):
     turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
     np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
     assert not drawn(draw_grid, np.zeros(size), lens, SAMPLER, samples=False)[0].lines
-    with pytest.raises(ValueError, match="one lens, got 2"):
-        drawn(draw_grid, np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
+    refused("one lens, got 2", drawn, draw_grid, np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
 
 
 def test_draw_samples_is_a_part_of_the_grid():
@@ -193,8 +193,7 @@ def test_a_palette_makes_a_png_small_and_keeps_its_size(tmp_path):
 
 @pytest.mark.parametrize("name", ["lens.gif", "lens", "lens.", "png", "a.png/b"])
 def test_other_endings_are_refused(name):
-    with pytest.raises(ValueError, match=rf"must end in one of \.png, .*, got '{name}'"):
-        figure_format(name)
+    refused(rf"must end in one of \.png, .*, got '{name}'", figure_format, name)
 
 
 def test_accuracy_of_each_model():

@@ -1,5 +1,6 @@
 """Scenes: pictures with a label or a distance for each pixel, and readers of their data sets."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -19,14 +20,15 @@ from darswin.data.scenes.woodscape import (
 from darswin.data.splits import check_split
 from darswin.utils.parameters import check
 
-# The first reader that recognizes a path opens it.
-READERS = (
-    (is_plain, open_plain),
-    (is_kitti360, open_kitti360),
-    (is_synwoodscape, open_synwoodscape),
-    (is_woodscape, open_woodscape),
-    (is_cityscapes, open_cityscapes),
-    (is_coco, open_coco),
+# The first reader that recognizes a path opens it. The last words say what a data set lacks.
+Reader = tuple[Callable[[Path], bool], Callable[[Path, Options], Scenes], dict[str, str]]
+READERS: tuple[Reader, ...] = (
+    (is_plain, open_plain, {}),
+    (is_kitti360, open_kitti360, {"labels": "KITTI-360, whose fisheye pictures have no labels"}),
+    (is_synwoodscape, open_synwoodscape, {}),
+    (is_woodscape, open_woodscape, {"distance": "WoodScape, which has labels but no distances"}),
+    (is_cityscapes, open_cityscapes, {"distance": "Cityscapes, which has labels but no distances"}),
+    (is_coco, open_coco, {"distance": "COCO panoptic, which has labels but no distances"}),
 )
 
 
@@ -97,8 +99,10 @@ def open_scenes(
     options = Options(
         split, target, lens, camera, coefficients, classes, splits, label_map, holdout
     )
-    for recognizes, open_split in READERS:
+    for recognizes, open_split, lacks in READERS:
         if recognizes(root):
+            if target in lacks:
+                raise ValueError(f"{root} looks like {lacks[target]}")
             scenes = open_split(root, options)
             scenes.channels = channels or scenes.form().channels
             return scenes

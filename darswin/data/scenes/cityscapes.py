@@ -9,12 +9,10 @@ Source: Cordts et al., Cityscapes, CVPR 2016, and github.com/mcordts/cityscapesS
 """
 
 import re
-from functools import partial
 from pathlib import Path
 
 from darswin.data.scenes.files import Options, pair, pictures_in, stems
 from darswin.data.scenes.scene import Classes, Scenes
-from darswin.data.scenes.targets import read_labels
 from darswin.data.splits import SPLITS, Split, some
 
 # The id, the name and the colour of each class.
@@ -49,8 +47,6 @@ def is_cityscapes(root: Path) -> bool:
 
 def open_cityscapes(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
-    if options.target != "labels":
-        raise ValueError(f"{root} looks like Cityscapes, which has labels but no distances")
     folders: dict[Split, Path] = {split: root / "leftImg8bit" / split for split in SPLITS[:2]}
     part, choose = options.choose_part({s: f for s, f in folders.items() if f.is_dir()}, root)
     targets = root / "gtFine" / part
@@ -63,13 +59,12 @@ def open_cityscapes(root: Path, options: Options) -> Scenes:
         root=root,
         what="labels",
     )
-    class_of, classes = options.labels(
+    classes, read = options.labels(
         lambda: Classes([name for _, name, _ in CLASSES], [color for _, _, color in CLASSES]),
         {id_: k for k, (id_, _, _) in enumerate(CLASSES)},
         IDS,
     )
     files, lenses = list(pairs.values()), options.shared_lens(root)
-    read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     return Scenes(root, files, lenses, target="labels", classes=classes, read=read)
 
 

@@ -46,8 +46,6 @@ def is_coco(root: Path) -> bool:
 
 def open_coco(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
-    if options.target != "labels":
-        raise ValueError(f"{root} looks like COCO panoptic, which has labels but no distances")
     parts = _files(root)
     part, choose = options.choose_part(parts, root)
     file = parts[part]
@@ -65,7 +63,7 @@ def open_coco(root: Path, options: Options) -> Scenes:
     if len(ids) < len(own):
         counts = Counter(category["id"] for category in categories)
         raise ValueError(f"{file} defines the category {counts.most_common(1)[0][0]} twice")
-    class_of, classes = options.labels(lambda: as_classes(own, colors, file), ids, ids)
+    class_of, classes = options.classes_of(lambda: as_classes(own, colors, file), ids, ids)
     assert class_of is not None
     folder = _first(root / "annotations" / file.stem, root / file.stem)
     targets = stems(folder, (".png",))

@@ -3,13 +3,16 @@
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below, warn_of_unread
 from darswin.data.scenes.scene import Classes, read_label_map, read_palette
-from darswin.data.scenes.targets import Target
+from darswin.data.scenes.targets import Target, read_labels
 from darswin.data.splits import (
     Split,
     part_of_split,
@@ -67,7 +70,12 @@ class Options:
                 raise naming(ValueError(text), name, "lens")
         return Calibrations(None, files=files)
 
-    def labels(
+    def labels(self, *arguments: Any, **named: Any) -> tuple[Classes, Callable[..., np.ndarray]]:
+        """The classes, and the function that reads a label file; arguments as `classes_of`."""
+        class_of, classes = self.classes_of(*arguments, **named)
+        return classes, partial(read_labels, classes=len(classes.names), class_of=class_of)
+
+    def classes_of(
         self,
         own: Callable[[], Classes],
         class_of: Mapping[int, int] | None = None,

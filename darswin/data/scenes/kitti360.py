@@ -23,8 +23,6 @@ def is_kitti360(root: Path) -> bool:
 
 def open_kitti360(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
-    if options.target != "distance":
-        raise ValueError(f"{root} looks like KITTI-360, whose fisheye pictures have no labels")
     pictures: dict[str, str] = {}
     for folder in sorted((root / "data_2d_raw").glob("*/image_0[23]/data_rgb")):
         drive, camera = folder.parts[-3:-1]

@@ -16,7 +16,7 @@ from darswin.data.scenes.files import (
     stems,
 )
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, read_palette
-from darswin.data.scenes.targets import KINDS, read_labels
+from darswin.data.scenes.targets import KINDS
 from darswin.data.splits import Split, split_folders
 from darswin.utils.parameters import naming
 
@@ -53,8 +53,7 @@ def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scene
     pairs = pair(pictures_in(folder / "images"), targets, choose, root=folder, what=target)
     classes, read = NO_CLASSES, KINDS[target].read
     if target == "labels":
-        class_of, classes = options.labels(partial(_classes, folder, root))
-        read = partial(read_labels, classes=len(classes.names), class_of=class_of)
+        classes, read = options.labels(partial(_classes, folder, root))
     lenses = options.given_lens(root) or _lenses(root, folder, pairs, options)
     files = list(pairs.values())
     return Scenes(folder, files, lenses, target=target, classes=classes, read=read)

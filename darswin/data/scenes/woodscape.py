@@ -23,7 +23,7 @@ import numpy as np
 
 from darswin.data.scenes.files import Options, lenses_beside, pair, pictures_in, stems
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes
-from darswin.data.scenes.targets import read_distance, read_labels
+from darswin.data.scenes.targets import read_distance
 from darswin.data.splits import Split
 from darswin.utils.parameters import naming
 from darswin.utils.text import read_json
@@ -55,26 +55,14 @@ def is_synwoodscape(root: Path) -> bool:
     )
 
 
-def open_woodscape(root: Path, options: Options) -> Scenes:
-    """A split; options and errors as `darswin.data.open_scenes`."""
-    if options.target != "labels":
-        raise ValueError(f"{root} looks like WoodScape, which has labels but no distances")
-    return _scenes(root, options, NAMES, trim=GREEN)
-
-
-def open_synwoodscape(root: Path, options: Options) -> Scenes:
-    """A split; options and errors as `darswin.data.open_scenes`."""
-    return _scenes(root, options, SYN_NAMES)
-
-
-def _scenes(
-    root: Path, options: Options, names: list[str], *, trim: tuple[int, int] = (0, 1)
+def open_woodscape(
+    root: Path, options: Options, names: list[str] = NAMES, trim: tuple[int, int] = GREEN
 ) -> Scenes:
+    """A split; options and errors as `darswin.data.open_scenes`."""
     target = options.target
     if target == "labels":
         targets = stems(unnested(root / "semantic_annotations") / "gtLabels", (".png",))
-        class_of, classes = options.labels(partial(_classes, root, names), ids=range(len(names)))
-        read = partial(read_labels, classes=len(classes.names), class_of=class_of)
+        classes, read = options.labels(partial(_classes, root, names), ids=range(len(names)))
     else:
         targets = stems(unnested(root / "depth_maps") / "raw_data", (".npy",))
         classes, read = NO_CLASSES, partial(read_distance, far=SKY)
@@ -92,6 +80,9 @@ def _scenes(
         root, list(pairs.values()), lenses, target=target, classes=classes,
         views=[_view_of(stem) for stem in pairs], read=read, trim=trim,
     )  # fmt: skip
+
+
+open_synwoodscape = partial(open_woodscape, names=SYN_NAMES, trim=(0, 1))
 
 
 def heal_swin(stems: list[str]) -> dict[Split, list[str]]:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
 from darswin.lens.files.named import PLANE, RADTAN, Named, flat
@@ -29,12 +28,10 @@ MAX_COEFFICIENTS = 64
 class CamOdoCal(Named):
     """One camera, called by its name in the file, or "camera"."""
 
-    def recognizes(self, content: Content) -> bool:
+    def _recognizes(self, content: Mapping) -> bool:
         # OpenCV's files may have a model_type, and distortion_parameters that are a matrix.
-        return isinstance(content, Mapping) and has_several(
-            [key for key, value in content.items() if key == "model_type" or _is_section(value)],
-            self.marks,
-        )
+        sections = (k for k, v in content.items() if isinstance(v, Mapping) and "data" not in v)
+        return has_several([*sections, *({"model_type"} & content.keys())], self.marks)
 
     def _found(self, content: Mapping) -> list[tuple[str, Fields]]:
         file = Fields(flat(content))
@@ -66,20 +63,14 @@ class OCamCalib(Format):
     keys = f"the lines of calib_results.txt ({', '.join(BLOCKS)})"
     is_table = True
 
-    def recognizes(self, content: Content) -> bool:
+    def _recognizes(self, content: list[list[str]]) -> bool:
         """True if the first of several lines counts its numbers, or the last three have 2, 3, 2."""
-        if not isinstance(content, list):
-            return False
         count, *words = content[0]
         counts = count == str(len(words)) and is_number(words[0]) and len(content) > 3
         return counts or [len(row) for row in content[-3:]] == [2, 3, 2]
 
     def cameras(self, file: list[list[str]], coefficients: str | None) -> Cameras:
         return {"camera": partial(_camera_of_rows, file)}
-
-
-def _is_section(value: Any) -> bool:
-    return isinstance(value, Mapping) and "data" not in value
 
 
 def _scaramuzza(file: Fields, kind: str, size: Any) -> Description:

@@ -5,7 +5,6 @@ from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.ideal import FieldOfView
@@ -62,8 +61,8 @@ class Colmap(Format):
         "KannalaBrandt (4 radial), Fisheye624 (6 radial), FieldOfView and EnhancedUnified"
     )
 
-    def recognizes(self, content: Content) -> bool:
-        row = content[0] if isinstance(content, list) else []
+    def _recognizes(self, content: list[list[str]]) -> bool:
+        row = content[0]
         return len(row) > 1 and (
             row[1] in MODELS
             or (row[1].isupper() and len(row) > 3 and all(map(is_number, row[2:4])))

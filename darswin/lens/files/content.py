@@ -63,10 +63,6 @@ _OTHERS = {
 _WANTED = "but must be a calibration: text in YAML, JSON or XML, a table, or np.savez's .npz"
 
 
-class _NoArraysError(Exception):
-    """A zip archive that np.savez did not write."""
-
-
 def read_bytes(path: str | os.PathLike) -> bytes:
     """The bytes of a file. Raises ValueError for a directory or device, for a large file, and for
     a picture, a video, an archive and the like."""
@@ -96,23 +92,21 @@ def _from_npz(data: bytes) -> str:
     arrays: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if not any(entry.filename.endswith(".npy") for entry in archive.infolist()):
-                raise _NoArraysError
-            small = [entry for entry in archive.infolist() if entry.file_size <= MAX_ARRAY]
+            entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
+            small = [entry for entry in entries if entry.file_size <= MAX_ARRAY]
             for entry in small[:MAX_ARRAYS]:
-                array, name = io.BytesIO(archive.read(entry)), entry.filename
-                if not name.endswith(".npy"):
-                    continue
+                array = io.BytesIO(archive.read(entry))
                 try:
                     value = np.load(array, allow_pickle=False).tolist()
                 except ValueError:
                     value = "dtype object"
-                arrays[name.removesuffix(".npy")] = value
-        return json.dumps(arrays)
-    except _NoArraysError as error:
-        raise ValueError(f"it is a zip archive, {_WANTED}") from error
+                arrays[entry.filename.removesuffix(".npy")] = value
+        text = json.dumps(arrays)
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for broken files
         raise ValueError("it must be an undamaged .npz file with arrays of numbers") from error
+    if not entries:  # np.savez did not write it
+        raise ValueError(f"it is a zip archive, {_WANTED}")
+    return text
 
 
 def parse(text: str) -> Content:

@@ -60,14 +60,6 @@ def to_side(value: Any, name: str, least: int = 1) -> int:
     return int(number)
 
 
-def to_sides(value: Any, name: str) -> tuple[int, int]:
-    """Two whole numbers of pixels, in the file's order, from a list or from text with spaces."""
-    words = value.split() if isinstance(value, str) else value
-    if not isinstance(words, list) or len(words) != 2:
-        raise ValueError(f"{name} must be two whole numbers of pixels, got {short(value)}")
-    return to_side(words[0], f"{name}[0]"), to_side(words[1], f"{name}[1]")
-
-
 def holds_numbers(value: Any) -> bool:
     """True for a number other than 0, and for a list or mapping that may hold one."""
     if isinstance(value, str):
@@ -157,15 +149,16 @@ class Fields:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(entries)}")
         return [Fields(entry, f"{self.path(name)}[{i}].") for i, entry in enumerate(entries)]
 
-    def number(self, name: str, default: float | None = None) -> float:
-        """The entry as a finite number; `default`, if given, for a missing entry."""
+    def number(self, name: str, default: float | None = None, *expected: Any) -> float:
+        """The entry as a finite number; `default`, if given, for a missing entry. `expected` are
+        the last arguments of `to_number`."""
         if default is not None and name not in self.entries:
             return default
-        return to_number(self.get(name, "a finite number"), self.path(name))
+        value = self.get(name, expected[0] if expected else "a finite number")
+        return to_number(value, self.path(name), *expected)
 
     def positive(self, name: str) -> float:
-        expected = "a finite number above 0"
-        return to_number(self.get(name, expected), self.path(name), expected, lambda n: n > 0)
+        return self.number(name, None, "a finite number above 0", lambda n: n > 0)
 
     def values(
         self, names: str, default: float | None = None, prefix: str = ""
@@ -185,8 +178,13 @@ class Fields:
         return to_side(self.get(name, "a whole number of pixels"), self.path(name))
 
     def sides(self, name: str) -> tuple[int, int]:
-        """Two sides of an image, px, in the file's order."""
-        return to_sides(self.get(name, "two whole numbers of pixels"), self.path(name))
+        """Two sides of an image, px, in the file's order, from a list or text with spaces."""
+        expected = "two whole numbers of pixels"
+        value, where = self.get(name, expected), self.path(name)
+        words = value.split() if isinstance(value, str) else value
+        if not isinstance(words, list) or len(words) != 2:
+            raise ValueError(f"{where} must be {expected}, got {short(value)}")
+        return to_side(words[0], f"{where}[0]"), to_side(words[1], f"{where}[1]")
 
     def text(self, name: str, expected: str = "text") -> str:
         return self.of_kind(name, str, expected)

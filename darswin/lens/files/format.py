@@ -50,7 +50,7 @@ class Intrinsics(NamedTuple):
 
 
 class Format:
-    """Base of the formats. A class sets `name` and `keys`, and defines `recognizes` and `cameras`.
+    """Base of the formats. A class sets `name` and `keys`, and defines `_recognizes` and `cameras`.
     Formats that are written also set `holds` and define `_text`."""
 
     name: str  # for errors
@@ -64,6 +64,10 @@ class Format:
     def recognizes(self, content: Content) -> bool:
         """True if a file's content is in this format. One common entry, such as "frames", does not
         make a format: it needs several, as in `has_several`."""
+        return isinstance(content, list) == self.is_table and self._recognizes(content)
+
+    def _recognizes(self, content: Any) -> bool:
+        """`recognizes` for a mapping, or for the rows of a table if the format's files are such."""
         raise NotImplementedError
 
     def cameras(self, file: Any, coefficients: str | None) -> Cameras:

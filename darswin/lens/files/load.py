@@ -13,7 +13,7 @@ from torch import Tensor
 from darswin.lens.base import Lens, from_dict, naming_degrees, with_rounded_theta_max
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.camodocal import CAMODOCAL, OCamCalib
-from darswin.lens.files.content import Content, decoded, parse, read_bytes
+from darswin.lens.files.content import decoded, parse, read_bytes
 from darswin.lens.files.fields import Fields, is_number, listed, plain_name, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.named import BASALT, KALIBR, NEIGHBOURS
@@ -88,7 +88,8 @@ def load_all(
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
     """Reads all cameras of a calibration file, by name. Arguments, warnings, errors: see `load`."""
-    return Calibration.read(path, coefficients).lenses(theta_max, image_size, dtype)
+    options = dict(theta_max=theta_max, image_size=image_size, dtype=dtype)
+    return Calibration.read(path, coefficients).lenses(**options)
 
 
 def load_up(path: str | os.PathLike) -> tuple[float, float, float]:
@@ -114,7 +115,10 @@ class Calibration:
         self.what, self._text = f"calibration {name}", text  # for errors
         with self._about():
             content = parse(text)
-            self.format = _format_of(content)
+            found = next((format for format in FORMATS if format.recognizes(content)), None)
+            if found is None:
+                raise ValueError(_UNKNOWN.format(unknown(content, FORMATS)))
+            self.format = found
         self.what = f"{self.format.name} {self.what}"
         with self._about():
             if coefficients is not None:
@@ -182,48 +186,31 @@ class Calibration:
                 shown += ", or its number"
             raise ValueError(f"camera must be one of {shown}, got {camera!r}")
 
-    def lens(
-        self,
-        camera: str | int | None = None,
-        theta_max: float | None = None,
-        image_size: Size = None,
-        dtype: torch.dtype | None = None,
-        *,
-        nominal: bool = False,
-    ) -> Lens:
-        """One camera; arguments and warnings are those of `load`.
+    def lens(self, camera: str | int | None = None, *options: Any, **named: Any) -> Lens:
+        """One camera; warnings are those of `load`, and options those of `judged`."""
+        name = self.choose(camera)
+        lens, doubt = self.judged(name, *options, **named)
+        self._warn({name: doubt})
+        return lens
+
+    def judged(
+        self, camera: str | int | None = None, *options: Any, nominal: bool = False, **named: Any
+    ) -> tuple[Lens, str]:
+        """One camera, and its `doubts` in place of a warning.
+
+        options: `theta_max`, `image_size` and `dtype` of `load`, in this order or by name.
 
         nominal: True if `image_size` stands in for a size that is not known, and the lens shall not
         be held against it.
         """
         name = self.choose(camera)
-        lens, doubt = self.judged(name, theta_max, image_size, dtype, nominal=nominal)
-        self._warn({name: doubt})
-        return lens
-
-    def judged(
-        self,
-        camera: str | int | None = None,
-        theta_max: float | None = None,
-        image_size: Size = None,
-        dtype: torch.dtype | None = None,
-        *,
-        nominal: bool = False,
-    ) -> tuple[Lens, str]:
-        """One camera, and its `doubts` in place of a warning; arguments as for `lens`."""
-        name = self.choose(camera)
         description = self._describe(name)
         with self._about(name):
-            lens, (doubt,) = _batch([description], self._missed(), theta_max, image_size, dtype)
+            lens, (doubt,) = _batch([description], self._missed(), *options, **named)
         return lens, "" if nominal and "image_size" not in description else doubt
 
-    def lenses(
-        self,
-        theta_max: float | None = None,
-        image_size: Size = None,
-        dtype: torch.dtype | None = None,
-    ) -> dict[str, Lens]:
-        """All cameras; arguments and warnings are those of `load_all`."""
+    def lenses(self, **options: Any) -> dict[str, Lens]:
+        """All cameras; warnings are those of `load_all`, and options those of `judged`."""
         # Frames often repeat one camera: each description becomes one lens, and descriptions of
         # the same shape become one batch.
         keys: dict[str, str] = {}
@@ -234,7 +221,7 @@ class Calibration:
             batches.setdefault(_shape(description), {}).setdefault(keys[name], name)
         found: dict[str, tuple[Lens, str]] = {}
         for firsts in batches.values():
-            lenses = self._together([*firsts.values()], theta_max, image_size, dtype)
+            lenses = self._together([*firsts.values()], options)
             found |= {key: lenses[name] for key, name in firsts.items()}
         self._warn({name: found[key][1] for name, key in keys.items()})
         return {name: found[key][0] for name, key in keys.items()}
@@ -248,19 +235,21 @@ class Calibration:
             text = f"{self.what}: {which}it describes {doubts[names[0]]}{more}"
             warnings.warn(text, ImplausibleLens, stacklevel=2)
 
-    def _together(self, names: list[str], *arguments) -> dict[str, tuple[Lens, str]]:
+    def _together(
+        self, names: list[str], options: Mapping[str, Any]
+    ) -> dict[str, tuple[Lens, str]]:
         """The lenses of cameras whose descriptions have one shape, and their doubts. Raises the
         error of the first camera that has one."""
         try:
             with self._about(names[0]):
                 described = [self._describe(name) for name in names]
-                lenses, said = _batch(described, self._missed(), *arguments)
+                lenses, said = _batch(described, self._missed(), **options)
         except ValueError:
             if len(names) == 1:
                 raise
             half = len(names) // 2
-            first = self._together(names[:half], *arguments)
-            return first | self._together(names[half:], *arguments)
+            first = self._together(names[:half], options)
+            return first | self._together(names[half:], options)
         return {name: (lenses[i], said[i]) for i, name in enumerate(names)}
 
     def _describe(self, name: str) -> Description:
@@ -294,13 +283,6 @@ class Calibration:
             raise ValueError(f"{self.what}: {which}{error}") from error
 
 
-def _format_of(content: Content) -> Format:
-    found = next((format for format in FORMATS if format.recognizes(content)), None)
-    if found is None:
-        raise ValueError(_UNKNOWN.format(unknown(content, FORMATS)))
-    return found
-
-
 def _shape(value: object) -> str:
     """The structure of a description without its numbers."""
     if isinstance(value, dict):
@@ -311,9 +293,9 @@ def _shape(value: object) -> str:
 def _batch(
     descriptions: list[Description],
     missed: float,
-    theta_max: float | None,
-    image_size: Size,
-    dtype: torch.dtype | None,
+    theta_max: float | None = None,
+    image_size: Size = None,
+    dtype: torch.dtype | None = None,
 ) -> tuple[Lens, list[str]]:
     """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents, and their
     doubts, which are about the file's θ_max, not the caller's."""

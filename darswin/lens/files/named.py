@@ -15,7 +15,6 @@ import yaml
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, like_coefficients, short
 from darswin.lens.files.format import (
     Cameras,
@@ -65,8 +64,8 @@ class Named(Format):
     label: str = KEY
     strict: str = "-"
 
-    def recognizes(self, content: Content) -> bool:
-        return isinstance(content, Mapping) and bool(self._found(content))
+    def _recognizes(self, content: Mapping) -> bool:
+        return bool(self._found(content))
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         found = self._found(file.entries)
@@ -205,8 +204,8 @@ class Kalibr(Named):
 class Basalt(Named):
     """Its cameras' sizes are in a list of their own."""
 
-    def recognizes(self, content: Content) -> bool:
-        calibration = content.get("value0") if isinstance(content, Mapping) else None
+    def _recognizes(self, content: Mapping) -> bool:
+        calibration = content.get("value0")
         return isinstance(calibration, Mapping) and "intrinsics" in calibration
 
     def _found(self, content: Mapping) -> list[tuple[str, Fields]]:

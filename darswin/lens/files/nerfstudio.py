@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import (
     Fields,
     holds_numbers,
@@ -15,7 +14,6 @@ from darswin.lens.files.fields import (
     plain_name,
     short,
     to_flag,
-    to_number,
 )
 from darswin.lens.files.format import Cameras, Description, Format, describe, has_several
 from darswin.lens.files.reader import SAYS_FISHEYE
@@ -40,18 +38,15 @@ class Nerfstudio(Format):
     origin = 0.5
     keys = "fl_x, fl_y, cx, cy and frames"
 
-    def recognizes(self, content: Content) -> bool:
-        if not isinstance(content, Mapping):
-            return False
+    def _recognizes(self, content: Mapping) -> bool:
         frames = content.get("frames")
         first = frames[0] if isinstance(frames, list) and frames else None
         keys = {*content, *(first if isinstance(first, Mapping) else ())}
         return has_several(keys, MARKS) or {ANGLES[0], "w", "h"} <= keys
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        frames = file.get("frames", "a list of mappings") if "frames" in file else []
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise ValueError(f"frames must be a list of mappings, got {short(frames)}")
+        sections = file.sections("frames") if "frames" in file else []
+        frames = [section.entries for section in sections]
         # Entries at the top level override those of the frames; one coefficient at the top level
         # overrides all coefficients of the frames.
         shared = {key: file.entries[key] for key in _of_camera(file.entries)}
@@ -78,7 +73,7 @@ def _of_camera(keys: Iterable[str]) -> set[str]:
     }  # fmt: skip
 
 
-def _frame(shared: dict[str, Any], own: set[str], frame: dict, where: str) -> Description:
+def _frame(shared: dict[str, Any], own: set[str], frame: Mapping, where: str) -> Description:
     return _camera(Fields(shared | {key: frame[key] for key in own if key in frame}, where))
 
 
@@ -128,7 +123,6 @@ def _of_angles(fields: Fields) -> dict[str, float]:
     expected = "above 0 and below π rad"
     for key, side, name in zip(ANGLES, ("w", "h"), ("fx", "fy"), strict=True):
         if key in fields:
-            angle = to_number(fields.get(key, expected), fields.path(key), expected,
-                              lambda angle: 0 < angle < math.pi)  # fmt: skip
+            angle = fields.number(key, None, expected, lambda angle: 0 < angle < math.pi)
             values[name] = fields.side(side) / 2 / math.tan(angle / 2)
     return {"fy": values["fx"]} | values

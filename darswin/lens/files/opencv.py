@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, plain_name, short
 from darswin.lens.files.format import Cameras, Format, Intrinsics, has_several
 from darswin.lens.files.reader import BESIDE, MATRIX, MODELS, ORDERS, PLANE, Reader, matrices
@@ -35,9 +34,7 @@ class OpenCV(Format):
         "only), Spherical and Mei (2 radial, tangential)"
     )
 
-    def recognizes(self, content: Content) -> bool:
-        if not isinstance(content, Mapping):
-            return False
+    def _recognizes(self, content: Mapping) -> bool:
         # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
         names = {plain_name(name): value for name, value in content.items()}
         return any(
@@ -91,8 +88,8 @@ class Ros(OpenCV):
     name = "ROS camera_info"
     keys = "k, d and distortion_model"
 
-    def recognizes(self, content: Content) -> bool:
-        return super().recognizes(content) and "distortion_model" in content
+    def _recognizes(self, content: Mapping) -> bool:
+        return super()._recognizes(content) and "distortion_model" in content
 
 
 class ByName(Format):
@@ -102,9 +99,7 @@ class ByName(Format):
     keys = "fx, fy, cx, cy, k1, …"
     takes_coefficients = True
 
-    def recognizes(self, content: Content) -> bool:
-        if not isinstance(content, Mapping):
-            return False
+    def _recognizes(self, content: Mapping) -> bool:
         names = {plain_name(name): value for name, value in content.items()}
         return {*PLANE} <= names.keys() and not any(
             isinstance(names.get(matrix), (list, Mapping)) for matrix in MATRIX
@@ -127,8 +122,8 @@ class MultiView(OpenCV):
     name = "OpenCV multi-view"
     keys = ", ".join(VIEWS)
 
-    def recognizes(self, content: Content) -> bool:
-        return isinstance(content, Mapping) and has_several(content, VIEWS)
+    def _recognizes(self, content: Mapping) -> bool:
+        return has_several(content, VIEWS)
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         numbers = {key: _flat(file.get(key, "the numbers of all cameras")) for key in VIEWS}

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from darswin.lens.base import IN_DEGREES, MODELS, ROUNDING, Lens, to_dict
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format
 from darswin.lens.ideal import FocalLens
@@ -25,9 +24,7 @@ class Own(Format):
     name = "darswin"
     keys = "model"
 
-    def recognizes(self, content: Content) -> bool:
-        if not isinstance(content, Mapping):
-            return False
+    def _recognizes(self, content: Mapping) -> bool:
         name = content.get("model")
         if not isinstance(name, str) or name not in MODELS:
             return False
@@ -44,8 +41,7 @@ class Own(Format):
         if "supported" not in file:
             return None
         expected = f"above 0 and at most {math.pi:.4g} rad"
-        value = file.get("supported", expected)
-        return to_number(value, file.path("supported"), expected, lambda x: 0 < x <= math.pi)
+        return file.number("supported", None, expected, lambda x: 0 < x <= math.pi)
 
     def write(self, lens: Lens, suffix: str, supported: float | None = None) -> str:
         said = {} if supported is None else {"supported": float(supported)}
@@ -94,15 +90,12 @@ def _angle(file: Fields, key: str, in_degrees: str) -> dict[str, float]:
     if in_degrees in file:
         most = math.degrees(ANGLES[key])
         expected = f"above 0 and at most {most:g} degrees"
-        value = file.get(in_degrees, expected)
-        number = to_number(value, file.path(in_degrees), expected, lambda x: 0 < x <= most)
-        return {in_degrees: number}
+        return {in_degrees: file.number(in_degrees, None, expected, lambda x: 0 < x <= most)}
     if key not in file:
         return {}
     expected = f"at most {ANGLES[key]:.4g} rad and above 0 ({in_degrees} takes degrees)"
     most = ANGLES[key] + ROUNDING
-    value = file.get(key, expected)
-    return {key: to_number(value, file.path(key), expected, lambda x: 0 < x <= most)}
+    return {key: file.number(key, None, expected, lambda x: 0 < x <= most)}
 
 
 def _value(value: Any, name: str, dims: int, most: int) -> Any:

@@ -20,7 +20,6 @@ from darswin.lens.files.fields import (
     to_side,
 )
 from darswin.lens.files.format import Description, describe
-from darswin.lens.files.message import in_message
 from darswin.lens.image import Size
 from darswin.lens.plausible import NEAR, off_middle, swap_fits
 from darswin.utils.parameters import naming
@@ -139,7 +138,7 @@ class Reader:
         size = self.image_size(suffix, (cx, cy))
         sensor: dict[str, list[float]] = {}
         if "distortion_model" in self.file:
-            size, sensor = in_message(self.file, plane, size)
+            size, sensor = _in_message(self.file, plane, size)
         return describe(model, plane | terms, size) | sensor
 
     def camera_by_name(self) -> Description:
@@ -278,6 +277,47 @@ def matrices(names: Mapping[str, Any]) -> list[tuple[str, Any]]:
         (m[2] or "", v) for m, v in found
         if m and (isinstance(v, (list, Mapping)) or not is_number(str(v)))
     ]  # fmt: skip
+
+
+def _in_message(
+    file: Fields, plane: dict[str, float], size: Size
+) -> tuple[Size, dict[str, list[float]]]:
+    """The image size of a ROS message, and the place of its region on the sensor, if any.
+    Changes `plane` from the sensor's pixels to the image's: the image shows the region `roi`,
+    and joins `binning_x` × `binning_y` pixels to one."""
+    roi = file.section("roi") if "roi" in file else Fields({})
+    left, top, width, height = (
+        _pixels(roi, name) for name in ("x_offset", "y_offset", "width", "height")
+    )
+    across, down = (max(_pixels(file, f"binning_{axis}"), 1) for axis in "xy")
+    sensor: dict[str, list[float]] = {}
+    if width or height or left or top:
+        rows, columns = size or (math.inf, math.inf)
+        if not (0 < width <= columns - left and 0 < height <= rows - top):
+            raise ValueError(
+                "roi must be a part of the image of 1 pixel or more, or all 0, got "
+                f"{width}×{height} px at ({left}, {top})"
+            )
+        if size is not None:
+            sides = size[0] / down, size[1] / across
+            sensor = {"sensor": [left / across, top / down, *sides]}
+        size = height, width
+    if size is not None:
+        size = size[0] // down, size[1] // across
+        if 0 in size:
+            raise ValueError(f"the binning of {across}×{down} pixels leaves none of the image")
+    plane["cx"] = (plane["cx"] - left + 0.5) / across - 0.5
+    plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
+    for name, count in (("fx", across), ("fy", down), ("skew", across)):
+        plane[name] /= count
+    return size, sensor
+
+
+def _pixels(fields: Fields, name: str) -> int:
+    """A number of pixels; 0 if the entry is missing."""
+    if name not in fields:
+        return 0
+    return to_side(fields.get(name, "a whole number of pixels"), fields.path(name), least=0)
 
 
 def _is_once(plain: str) -> bool:

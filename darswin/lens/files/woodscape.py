@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
 from darswin.lens.polynomial import Polynomial
@@ -21,8 +20,8 @@ class WoodScape(Format):
     origin = 0.5
     keys = "intrinsic with poly_order, k1, k2, …"
 
-    def recognizes(self, content: Content) -> bool:
-        intrinsic = content.get("intrinsic") if isinstance(content, Mapping) else None
+    def _recognizes(self, content: Mapping) -> bool:
+        intrinsic = content.get("intrinsic")
         return isinstance(intrinsic, Mapping) and has_several(intrinsic, MARKS)
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 
-from darswin.utils.quiet import quiet_export
+from darswin.deploy.export import quiet_export
 
 LOGGER = logging.getLogger("torch.onnx._internal.exporter")
 
