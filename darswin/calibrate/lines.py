@@ -26,6 +26,7 @@ from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
+from darswin.utils.words import in_px
 
 MOST, FEWEST = 120, 10  # curves: of a picture, and of all
 STEP = 4  # points of an edge that are averaged
@@ -105,8 +106,8 @@ def estimate(
         check("fov", fov, 0 < fov < 2 * math.pi, "above 0 and below 2π")
     sizes = {picture.shape[:2] for picture in pictures}
     if len(sizes) != 1:
-        found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
-        raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
+        found = ", ".join(map(in_px, sorted(sizes))) or "no pictures"
+        raise ValueError(f"pictures must be of one camera and one size, got {found}")
     if min(min(sizes)) < (least := boards.LEAST_SIDE):
         raise ValueError(f"pictures must have at least {least} × {least} px")
     circle = image_circle(pictures)

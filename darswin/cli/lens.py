@@ -16,6 +16,7 @@ from darswin.lens.files.save import closest
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
 from darswin.utils.parameters import check
+from darswin.utils.words import in_px
 from darswin.views import PolarView
 from darswin.viz.report import describe
 
@@ -131,10 +132,7 @@ def info(
 
 
 def _in_short(lens: Lens, doubt: str) -> str:
-    size = ""
-    if lens.image_size is not None:
-        height, width = (round(side) for side in lens.image_size[0].tolist())
-        size = f", {width} × {height} px"
+    size = "" if lens.image_size is None else f", {in_px(lens.image_size[0])}"
     wrong = f"; looks wrong: {doubt}" if doubt else ""
     return f"{type(lens).__name__}{size}, up to {math.degrees(lens.theta_max.item()):.2f}°{wrong}"
 
@@ -229,7 +227,7 @@ def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
     top, left, height, width = box
     rows, columns = (round(side) for side in lens.image_size[0].tolist())
     meets = -height < top < rows and -width < left < columns
-    picture = f"the picture of {columns} × {rows} px (W × H)"
+    picture = f"the picture of {in_px((rows, columns))}"
     check("box", box, meets, f"a part of {picture}")
     inside = min(top, left) >= 0 and top + height <= rows and left + width <= columns
     return "" if inside else f"; the box extends beyond {picture}, which means padding"

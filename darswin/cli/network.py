@@ -33,6 +33,7 @@ from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
+from darswin.utils.words import in_px
 from darswin.views import PlainView, Remap
 from darswin.views.floor import check_floor
 from darswin.viz.pixels import draw_instances, label_image, overlay, palette
@@ -126,8 +127,8 @@ class NetworkAnswers(Answers):
             pixels = Pixels(tuple(mean or (0.0,)), tuple(std or (1.0,)), pixels.channels)
         pixels = pixels._replace(channels=channels or pixels.channels)
         self.view = make(self.network.size, mean=pixels.mean, std=pixels.std)
-        sides = "×".join(map(str, reversed(self.network.size or ())))
-        self.shown = f" by the view {view or VIEW}{sides and f' of {sides} px (W×H)'}"
+        sides = f" of {in_px(self.network.size)}" if self.network.size else ""
+        self.shown = f" by the view {view or VIEW}{sides}"
         self._mean, self._std = (
             per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
         )
@@ -216,12 +217,9 @@ class NetworkAnswers(Answers):
 
     def _bound_to(self, size: tuple[int, int], lens: Lens) -> BoundView:
         if isinstance(self.view, PlainView) and size != self.network.size:
-            (height, width), (own_height, own_width) = size, self.network.size
-            text = (
-                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}"
-            )
+            text = f"the picture has {in_px(size)}, but the network takes {in_px(self.network.size)}"
             text += ": choose a view that resamples it"
-            text += "" if self.network.has_size else f", or give it by `size`, {height},{width}"
+            text += "" if self.network.has_size else ", or give it by `size`, {},{}".format(*size)
             raise naming(ValueError(text), "size")
         remap = self.view.at(lens, size)
         output = self.network.output

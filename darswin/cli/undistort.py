@@ -16,6 +16,7 @@ from darswin.lens.files.load import reach
 from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
+from darswin.utils.words import in_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -159,7 +160,7 @@ class _Views:
         # Without a θ_max in the file, the lens ends at the picture's sides, and corners see more.
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
-        self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
+        self._said.add(f"{fov_deg:.4g}° across, {in_px((height, width))}")
         remap = view.at(exact, size)
         return _Viewed(remap.sampler(), remap.camera)
 

@@ -8,6 +8,7 @@ import torch
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
 from darswin.lens.polynomial import PolynomialLens
+from darswin.utils.words import in_px
 
 # The thresholds lie far from real lenses. Their image circles are as large as the picture's shorter
 # side or larger, and half the diagonal spans 0.4 to 4 rad in pixels of the axis. Small circles in
@@ -95,7 +96,7 @@ def _doubt(
         oddities.insert(0, f"px per degree that change {change:.2g}-fold, as after a failed fit")
     if missed > MOST_MISSED:
         oddities.insert(0, f"corners that its calibration missed by {missed:.3g} px")
-    shown = f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(oddities)}{guess}"
+    shown = f"a picture of {in_px(size)} with {' and '.join(oddities)}{guess}"
     return shown if oddities else ""
 
 
@@ -147,7 +148,7 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
     if x > 0 and y > 0 and MOST_APART > (ratio := width * y / height / x) > 1 / MOST_APART:
         factor = width / x / 2 / math.sqrt(ratio)  # from these lengths to px
         if LEAST_SIDE * factor < min(width, height) < MOST_SIDE * factor:
-            fit = f"the lengths would fit {width / factor:.0f} × {height / factor:.0f} px"
+            fit = f"the lengths would fit {in_px((height / factor, width / factor))}"
             return f"; {fit}, or the picture is a crop"
         if units := _nearest(UNITS, factor):
             return f"; the lengths would fit {units}"

@@ -255,7 +255,7 @@ def test_a_stream_ends_by_ctrl_c_with_its_predictions(disc, monkeypatch, capsys)
         assert Path("out", entry["overlay"]).is_file()
     assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
     for lens in (json.dumps(WIDE | {"image_size": [9, 9]}), "."):
-        with pytest.raises(SystemExit, match=r"for 9×9|no calibration in") as error:
+        with pytest.raises(SystemExit, match=r"for 9 × 9|no calibration in") as error:
             main(["predict", *command.split(), "--lens", lens, "--out", "out"])
         assert "secret" not in str(error.value)
     assert "secret" not in capsys.readouterr().err
@@ -284,7 +284,7 @@ def test_what_a_network_needs(disc, monkeypatch):
     ):
         write_graph(Path("n.onnx"), size=size)
         known = "" if size[0] == 256 else "--size 256,256"
-        with pytest.raises(SystemExit, match=rf"p\.png .* is 320×240, .* takes 256×256: .*{said}"):
+        with pytest.raises(SystemExit, match=rf"p\.png .* has 240 × 320 px .* takes 256 × 256 px .*{said}"):
             predict(f"p.png --network n.onnx --view none {known}")
         assert Path("out/predictions.json").read_text() == "[]"
     monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")

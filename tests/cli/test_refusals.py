@@ -125,7 +125,7 @@ REFUSED = {
     "lens": r"""
         draw front.json => invalid choice: 'draw'
         show => arguments are required: calib, image
-        show front.json square.png => for 1280×966 \(W×H\) but the picture is 40×40
+        show front.json square.png => for 966 × 1280 px \(H × W\), but the picture has 40 × 40
         show front.json none.png => ^darswin: cannot read none.png: No such file[^(]*$
         show front.json front.png --out front.png => --out front.png would replace front.png
         info wrong.json => wrong.json
@@ -137,7 +137,7 @@ REFUSED = {
         crop front.json new.json --box 0,0,9,9 --size 0,9 => --size must be from 1 to .*, got 0
         crop front.json new.json --box 0,0,0,9 => --box must be from 1 to 1000000 px, got 0
         crop front.json new.json => missing --box or --size
-        crop front.json new.json --box=966,0,9,9 => --box must be a part of the picture of 1280 × 9
+        crop front.json new.json --box=966,0,9,9 => --box must be a part of the picture of 966 × 1
         crop front.json new.json --box=0,-9,9,9 => --box must be a part of the picture
         crop front.json new.json --box=1,2,3 => --box must be 4 whole numbers
         crop bare.json new.json --image_size 0,9 --size 9,9 => --image_size must be from 1 to 1000

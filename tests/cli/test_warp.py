@@ -315,7 +315,7 @@ def test_what_cannot_be_read_is_named_at_the_end(flat, capsys):
 
     said = refused(capsys, edited(flat, edit), WIDE)
     for words in (
-        "1 of 2 pictures were left out", "3 pictures and annotations of", "1.png has 400 × 9 px",
+        "1 of 2 pictures were left out", "3 pictures and annotations of", "1.png has 9 × 400,",
         "no picture no.png", "annotation 1 has the box", "annotation 2 has the category 9",
     ):  # fmt: skip
         assert words in said
