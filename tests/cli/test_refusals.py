@@ -21,7 +21,7 @@ REFUSED = {
         models swin => unrecognized arguments: swin
         models --zzzzzz 2 => unrecognized arguments: --zzzzzz 2; see `darswin models --help`
         convert => the following arguments are required: source, target
-        convert none.pth out.safetensors => No such file or directory: 'none.pth'
+        convert none.pth out.safetensors => ^darswin: none.pth: No such file or directory$
         convert a b --fast => unrecognized arguments: --fast
         quantize --run r --tolerence 2 => the nearest option is --tolerance; see
         quantize --run . --pictures 0 => --pictures must be at least 1, got 0
@@ -31,7 +31,7 @@ REFUSED = {
     """,
     "predict": r"""
         none.png p.png a.mp4 --run . --lens lens.json => no file or folder none\.png, a\.mp4$
-        p.png --model m.safetensors --lens lens.json => No such file .*m\.safetensors
+        p.png --model m.safetensors --lens lens.json => ^darswin: m\.safetensors: No such file
         none.png --lens lens.json => give either --run, .* or --model, a safetensors file or one of
         p.png --model digits --run . => or --model, a safetensors file or one of digits
         p.png --model digits => missing --lens: give the camera
@@ -85,7 +85,8 @@ REFUSED = {
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be from 0 to 1, as scores are, got nan
         n.onnx --threshold 30 => --threshold must be from 0 to 1, as scores are, got 30
-        n.onnx --labels gone.txt => gone.txt
+        n.onnx --labels gone.txt => --labels must .* names .*, got gone.txt: No such file
+        n.onnx --out found.json => --out must be a folder, but found.json has the ending of a file
         n.onnx --task distance => --task does not go with --network
         maps.onnx --form pose => --form must be one that its outputs may have, numbers, got pose
         n.onnx --height 2 => --height needs --up, the direction away from gravity
@@ -235,6 +236,8 @@ REFUSED = {
     """,
     "fit --config minutes --data.path digits --run": r"""
         => ^darswin fit: argument --run: expected one argument; see `darswin fit --help`$
+        /proc/x => --run must be a folder that can be written, got /proc/x
+        a.json => --run must be a folder, but a.json has the ending of a file: leave it out
         done => done holds a run already: continue it with --resume
         best.safetensors => --run names .* best.safetensors is a file\. --model.weights takes a mo
         began/checkpoints/best.ckpt => this one belongs to the run began\. --ckpt_path takes
