@@ -78,11 +78,11 @@ def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadine
     if found.left_out > GUESSED * max(found.sigma, SHARPEST):
         said.append(
             f"pictures that were left out are missed by {found.left_out:.3g} px, but the noise is "
-            f"{found.sigma:.2g} px: take more pictures"
+            f"{found.noise:.2g} px: take more pictures"
         )
     if found.sigma > BLURRED:
         said.append(
-            f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
+            f"corners are {found.noise:.2g} px off: the pictures are blurred, the board is bent, "
             "or another model fits better"
         )
     far = middles.norm(dim=1)

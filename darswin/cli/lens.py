@@ -156,10 +156,10 @@ def convert(
         camera: the name or number of the camera, if the file has several.
         coefficients: the distortion model of an OpenCV or ROS file that does not name it.
         format: the format of the new file. The default is OpenCV for .xml, .yaml and .yml, but
-            Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and else the JSON
+            Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and for .json that
             of darswin, which can hold any lens.
     """
-    check_lens_out(out, (calib,))
+    check_lens_out(out, (calib,), format)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
     note = ""
@@ -209,7 +209,7 @@ def crop(
     for name, sides in (("box", (box or ())[2:]), ("size", size or ())):
         for side in sides:
             check(name, side, 1 <= side <= 10**6, _SIDES)
-    check_lens_out(out, (calib,))
+    check_lens_out(out, (calib,), format)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""
     if box is not None:

@@ -336,6 +336,8 @@ class WideAngleData(RunData):
             if value is not None and self._lens is None:
                 text = f"`{name}` {value} needs a calibration: give `lens`"
                 raise naming(ValueError(text), name, "lens")
+        hint = f" ({fov_deg:g} radians are {math.degrees(fov_deg):.0f}°)" if fov_deg < 10 else ""
+        check("fov_deg", f"{fov_deg:g}°{hint}", 10 <= fov_deg < 180, "from 10° to below 180°")
         self.train_lenses = parse_lenses(train_lenses)
         self._test_lenses = parse_sweep(test_lenses)
         self._warping: dict[str, Any] = dict(

@@ -149,6 +149,12 @@ def frame_rate(path: str | Path) -> float:
     return rate if 0 < rate < math.inf else 25.0
 
 
+def frame_count(path: str | Path) -> int:
+    """The number of frames that a video file names; 0 if it names none."""
+    capture = _opened(path)
+    return 0 if capture is None else max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+
 def write_frames(path: str | Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Writes frames (H, W, 3) uint8, RGB, as a video (MPEG-4, no sound); without frames, nothing.
 

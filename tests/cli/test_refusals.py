@@ -22,6 +22,7 @@ REFUSED = {
         models --zzzzzz 2 => unrecognized arguments: --zzzzzz 2; see `darswin models --help`
         convert => the following arguments are required: source, target
         convert none.pth out.safetensors => ^darswin: none.pth: No such file or directory$
+        convert best.safetensors x.foo => the target must end in .safetensors, got x.foo
         convert a b --fast => unrecognized arguments: --fast
         quantize --run r --tolerence 2 => the nearest option is --tolerance; see
         quantize --run . --pictures 0 => --pictures must be at least 1, got 0
@@ -130,10 +131,12 @@ REFUSED = {
         show front.json none.png => ^darswin: cannot read none.png: No such file[^(]*$
         show front.json front.png --out front.png => --out front.png would replace front.png
         info wrong.json => wrong.json
+        info front.json --image_size 960 => 2 whole numbers, got .*: height and width of the .* 960,1280
         info bare.json => lacks the size of its images: give --image_size, their height
         info front.json --coeficients x => the nearest option is --coefficients; see `darswin
         convert front.json front.json --model Mei => --out front.json would replace front.json
         convert front.json p.png => --out p.png would replace a file that is no calibration
+        convert front.json x.foo => ending of x.foo names no format: .* .txt, .* or give --format
         crop front.json ./front.json --box 0,0,9,9 => --out ./front.json would replace
         crop front.json new.json --box 0,0,9,9 --size 0,9 => --size must be from 1 to .*, got 0
         crop front.json new.json --box 0,0,0,9 => --box must be from 1 to 1000000 px, got 0
@@ -187,7 +190,7 @@ REFUSED = {
     "lens calibrate --board=6x5 --square=0.03 --model=Mei": r"""
         => missing pictures
         empty => no pictures or videos in empty
-        films => missing pictures
+        films => 0 of 0 pictures show the board of --board 6x5: .*$
         none => no file or folder none
         boards --kind=round => --kind must be one of chessboard, charuco, april
         boards --kind=charuco => --kind charuco needs --marker
@@ -252,6 +255,7 @@ REFUSED = {
         r --model.options {"embed_dim":1099511627776} => not enough memory: a smaller --data.batch
         r --model.name swin_unet_nano => swin_unet_nano is no model for --task classification
         r --model.matmul_backend mkl => model.matmul_backend
+        r --data.fov_deg 3 => --data.fov_deg must be from 10° .*180°, got 3° \(3 radians are 172°\)
         r --trainer.overfit_batches 2 => overfit_batches shuffles otherwise: take --data.limit
         r --trainer.max_epochs many => error: --trainer.max_epochs:
         r --trainer.max_epochs -1 => cosine needs an end: set --trainer.max_epochs or
