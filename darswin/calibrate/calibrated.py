@@ -71,7 +71,7 @@ class CalibratedLens:
 
     @property
     def noise(self) -> float:
-        """px: the root mean square distance of corners by `sigma`, as `error` and `left_out` are."""
+        """px: by `sigma`, the root mean square distance of corners, as `error` and `left_out`."""
         return math.sqrt(2) * self.sigma
 
     def uncertainty(self, pixels: Any) -> Tensor:

@@ -26,7 +26,7 @@ from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
-from darswin.utils.words import in_px
+from darswin.utils.words import counted, in_px
 
 MOST, FEWEST = 120, 10  # curves: of a picture, and of all
 STEP = 4  # points of an edge that are averaged
@@ -117,7 +117,8 @@ def estimate(
     for number, picture in enumerate(pictures, 1):
         found_curves.append(edges.curves(picture))
         if progress is not None:
-            progress(f"picture {number} of {len(pictures)}: {len(found_curves[-1])} curves")
+            found = counted(len(found_curves[-1]), "curve")
+            progress(f"picture {number} of {len(pictures)}: {found}")
     return from_curves(found_curves, sizes.pop(), model, center=center, fov=fov, circle=circle)
 
 
@@ -176,7 +177,8 @@ def from_curves(
     oriented = (second >= SECOND[0]).sum()
     unsure = sigma > UNSURE * rim or spread > OPEN
     sets = "hardly set" if unsure else "set"
-    source = f"orthogonal directions in {oriented} of {len(curves)} pictures {sets} the scale"
+    where = f"{oriented} of {counted(len(curves), 'picture')}"
+    source = f"orthogonal directions in {where} {sets} the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
@@ -219,7 +221,7 @@ def _curve(lens: Lens, radius: float) -> np.ndarray:
 def _check(count: int) -> None:
     if count < FEWEST:
         raise CalibrationError(
-            f"only {count} curves may be straight lines, but an estimate needs {FEWEST}: "
+            f"only {counted(count, 'curve')} may be straight, but an estimate needs {FEWEST}: "
             "give more pictures, or some of rooms, houses or streets"
         )
 

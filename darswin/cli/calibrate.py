@@ -19,7 +19,7 @@ from darswin.lens.files.save import format_of, is_held
 from darswin.utils.exif import TURNS
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
-from darswin.utils.words import in_px
+from darswin.utils.words import counted, in_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,9 +46,9 @@ def calibrate(
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
-    It takes 10 to 20 pictures, or a video, in which the board is tilted, at several distances, and everywhere in
-    the picture, also at its rim. Pixels are those that the camera stores, as in all calibrations.
-    Pictures that cannot be read are named at the end; the calibration is made from all others.
+    It takes 10 to 20 pictures, or a video, in which the board is tilted, at several distances, and
+    everywhere in the picture, also at its rim. Pixels are those that the camera stores, as in all
+    calibrations. Pictures that cannot be read are named at the end; all others are used.
 
     Args:
         pictures: pictures, videos, and folders of them. Of a video, the sharpest frames of 40 equal
@@ -106,7 +106,8 @@ def calibrate(
     with Progress("corners", len(files)) as progress:
         seen = _look(files, made, progress)
     if len(seen.names) < LEAST:
-        few = f"{len(seen.names)} of {seen.total} pictures show the board of --board {board}"
+        total = counted(seen.total, "picture")
+        few = f"{len(seen.names)} of {total} with the board of --board {board}"
         why = "; ".join([f"{few}: {LEAST} are needed, and 10 to 20 are better", *seen.doubts])
         raise ValueError("\n".join([why, *seen.broken.errors]))
     with Progress("calibrate") as progress:

@@ -24,6 +24,7 @@ from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_stream
+from darswin.utils.words import counted
 
 ANSWERS = "predictions.json"
 
@@ -224,8 +225,8 @@ def _predict(
     if out is not None and entries:
         print(_summary(entries, out, answers.shown))
     videos = any(file.is_video for file in files)
-    what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
-    count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
+    what, kind = ("complete prediction", "file") if videos else ("prediction", "picture")
+    count = f"no {what} for {len(broken.errors)} of {counted(len(files), kind)}:"
     broken.report(count if entries else "")
     return entries
 
@@ -234,8 +235,8 @@ def _summary(entries: Sequence[Mapping[str, Any]], out: str, shown: str) -> str:
     """How many pictures have predictions, and where; shown: what the network sees, in words."""
     pictures = [entry for entry in entries if "frames_per_second" not in entry]
     counts = [len(entry["detections"]) for entry in pictures if "detections" in entry]
-    text = f"{out}: {len(pictures)} picture{'s' * (len(pictures) != 1)}{shown}"
-    text += f", {sum(counts)} detection{'s' * (sum(counts) != 1)}" if counts else ""
+    text = f"{out}: {counted(len(pictures), 'picture')}{shown}"
+    text += f", {counted(sum(counts), 'detection')}" if counts else ""
     drawn = any("overlay" in entry for entry in pictures)
     return text + f"; {Path(out).parent / 'overlays'} shows them" * drawn
 

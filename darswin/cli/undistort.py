@@ -16,7 +16,7 @@ from darswin.lens.files.load import reach
 from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
-from darswin.utils.words import in_px
+from darswin.utils.words import counted, in_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,7 +115,7 @@ def undistort(
         _write_lens(folder, written)
     if written:
         with_lens = f"; their calibration is {folder / LENS}" * (folder / LENS).exists()
-        print(f"{folder}: {len(written)} of {len(files)} files, {views.said}{with_lens}")
+        print(f"{folder}: {len(written)} of {counted(len(files), 'file')}, {views.said}{with_lens}")
     broken.report()
 
 

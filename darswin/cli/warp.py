@@ -39,6 +39,7 @@ from darswin.utils.image import (
 from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
+from darswin.utils.words import counted
 from darswin.views import CameraView, PixelView, list_views
 from darswin.views.camera import picture_size
 
@@ -308,19 +309,20 @@ def _write(
     assert data.lenses is not None
     cameras = listed(camera.name for camera in data.lenses.cameras)
     print(f"pictures by {cameras}, as {settings['to']} sees them")
-    print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
+    done, instances = len(data) - len(bad), counted(count, "instance")
+    print(f"{folder}: {len(pictures)} from {done} of {counted(len(data), 'picture')}, {instances}")
     large = sum(lost["fits_no_tile"] for lost in left)
     share = f"{LEAST_VISIBLE:.0%} of them"
     for number, what in (
-        (len(left) - large, f"have left the picture, because less than {share} is visible"),
-        (large, f"are too large for the tiles: none shows {share}, only several together"),
+        (len(left) - large, f"left the picture, because less than {share} is visible"),
+        (large, f"too large for the tiles: none shows {share}, only several together"),
     ):
         if number:
-            print(f"{number} instances {what}; {folder / LEFT} lists them")
+            print(f"{counted(number, 'instance')} {what}; see {folder / LEFT}")
     report: list[str] = []
     for texts, what in (
-        (bad, f"{len(bad)} of {len(data)} pictures were left out"),
-        (wrong, f"{len(wrong)} pictures and annotations of the labels were left out"),
+        (bad, f"left out: {len(bad)} of {counted(len(data), 'picture')}"),
+        (wrong, f"left out: {len(wrong)} of the pictures and annotations in the labels"),
     ):
         if texts:
             more = [f"and {len(texts) - _NAMED} more"] * (len(texts) > _NAMED)

@@ -26,6 +26,7 @@ from darswin.lens.files.reader import Coefficients
 from darswin.train.runs import ignore_signals
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit
+from darswin.utils.words import counted
 
 SMALLEST = 32  # px, the size of images of smaller pictures
 
@@ -285,7 +286,7 @@ class RunData(LightningDataModule):
         part = range(place["rank"], count, place["world"])
         if not part:
             raise ValueError(
-                f"the {split!r} split has {count} pictures, too few for the processes of this run"
+                f"the {split!r} split has {counted(count, 'picture')}, fewer than processes"
             )
         return DataLoader(dataset, self.batch_size, sampler=part, **self._options)
 

@@ -160,7 +160,8 @@ def _corners(lens: Lens, image_size: tuple[int, int]) -> str:
     if math.isnan(sum(widest)):
         return "the lens ends before the corners"
     beyond = " (beyond θ_max)" * (max(widest) > lens.theta_max.item() + MARGIN)
-    return f"{_degrees(max(widest[0] + widest[3], widest[1] + widest[2]))} between the corners{beyond}"
+    across = max(widest[0] + widest[3], widest[1] + widest[2])
+    return f"{_degrees(across)} between the corners{beyond}"
 
 
 def _density(lens: Lens) -> list[tuple[str, str]]:

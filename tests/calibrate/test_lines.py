@@ -211,7 +211,7 @@ def test_few_orthogonal_lines_are_a_doubt(of_second, askew, doubt):
 
 def test_too_little_evidence_is_refused_in_one_sentence():
     for curves in ([], [[]], [curves_of(LENSES["equidistant"], 1, 5, askew=0, bent=2)]):
-        said = "curves may be straight lines, but"
+        said = "may be straight, but"
         assert "\n" not in refused(said, from_curves, curves, SIZE, error=CalibrationError)
 
 

@@ -50,7 +50,7 @@ def test_the_size_of_a_training_its_end_and_what_is_next(tmp_path, capsys):
     said = capsys.readouterr().err.splitlines()
     sizes = "; 96 training and 96 validation pictures; 3 steps an epoch, 6 in all"
     assert said[0].endswith(sizes) and said[0].startswith("darswin_a_nano with ")
-    assert said[1].startswith("darswin: 6 steps are too few to learn from scratch, which takes 100")
+    assert said[1].startswith("darswin: 6 steps cannot teach a new model, which takes 100")
     best = checkpoint(run, "best")["callbacks"]
     (score,) = (state["best_model_score"] for name, state in best.items() if "val/top1" in name)
     assert (
@@ -103,7 +103,7 @@ NUMBER = r"[\d.,–-]+"
 OURS = [
     r"epoch \d+, step \d+: train/loss ",
     rf"darswin_a_nano with {NUMBER} parameters; {NUMBER} training and {NUMBER} validation pictures",
-    r"darswin: \d+ steps are too few to learn from scratch",
+    r"darswin: \d+ steps cannot teach a new model",
     r"darswin: the learning rate rises during 2 of the 2 steps: ",
     r"--trainer\.max_steps -1 in place of 2$",
     r"finished at step [24], (best val/top1|no validation)",

@@ -149,8 +149,8 @@ def test_a_folder_as_people_have_it(folder, capsys, monkeypatch, orientation):
 def test_a_video_is_read_by_its_sharpest_frames(folder, capsys):
     boards = [cv2.imread(str(file)) for file in sorted((folder / "boards").iterdir())]
     blurred = [cv2.GaussianBlur(board, (0, 0), 3.0) for board in boards]
-    frames = [frame for pair in zip(boards, blurred, strict=True) for frame in (*pair[1:] * 2, *pair)]
-    write_frames("film.mp4", [*frames, *blurred[:1]], 10.0)  # every fourth one is sharp
+    frames = [frame for a, b in zip(boards, blurred, strict=True) for frame in (b, b, a, b)]
+    write_frames("film.mp4", [*frames, *blurred[:1]], 10.0)
     calibrate("film.mp4", *BOARD, "--picture=made.png", "--report=report.json")
     assert "looks wrong     blurred" not in capsys.readouterr().out
     assert_is_true(lens.load("camera.json", dtype=torch.float64))
@@ -238,12 +238,12 @@ def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     some = [f"boards/{k}.png" for k in (0, 1)]
     line = refusal(capsys, *some, "--board=7x4", "--square=1")
     assert line.endswith(
-        "0 of 2 pictures show the board of --board 7x4: 3 are needed, and 10 to 20 are better; "
+        "0 of 2 pictures with the board of --board 7x4: 3 are needed, and 10 to 20 are better; "
         "no board found in boards/0.png, boards/1.png: they show 6x5 inner corners"
     )
     line = refusal(capsys, *some, *BOARD)
     assert line.endswith(
-        "2 of 2 pictures show the board of --board 6x5: 3 are needed, and 10 to 20 are better"
+        "2 of 2 pictures with the board of --board 6x5: 3 are needed, and 10 to 20 are better"
     )
     (folder / "broken.png").write_bytes((folder / "boards/0.png").read_bytes()[:2000])
     assert "cannot read broken.png" in refusal(capsys, *some, "broken.png", *BOARD)

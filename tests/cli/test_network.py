@@ -212,7 +212,9 @@ def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(capsys):
     write("p.png", np.zeros((*SIZE, 3), np.uint8))
     lens = WIDE | {"theta_max": 1.0}  # 88 px around (163, 117)
     (entry,) = predict("p.png --network n.onnx --labels names.json --view stereographic", lens)
-    assert "2 of 8 boxes of n.onnx have no area and are left out" in capsys.readouterr().err
+    assert (
+        "n.onnx: left out, because they have no area, are 2 of 8 boxes" in capsys.readouterr().err
+    )
     labels = [thing["label"] for thing in entry["detections"]]
     assert labels == ["inside", "cut", "half outside", "inside"]  # the best first
     kept = dict(zip(labels[:3], entry["detections"], strict=False))
@@ -284,7 +286,7 @@ def test_what_a_network_needs(disc, monkeypatch):
     ):
         write_graph(Path("n.onnx"), size=size)
         known = "" if size[0] == 256 else "--size 256,256"
-        with pytest.raises(SystemExit, match=rf"p\.png .* has 240 × 320 px .* takes 256 × 256 px .*{said}"):
+        with pytest.raises(SystemExit, match=rf"p\.png .* 240 × 320 px .* 256 × 256 px .*{said}"):
             predict(f"p.png --network n.onnx --view none {known}")
         assert Path("out/predictions.json").read_text() == "[]"
     monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")
@@ -296,7 +298,7 @@ def test_what_a_network_needs(disc, monkeypatch):
     ("outputs", "options", "said"),
     [
         ("nan boxes", "", r"no prediction for .*b\.png: .*n\.onnx computes NaN"),
-        ("named", "--labels names.txt", "class 1, but --labels has 1 names, from 0 to 0"),
+        ("named", "--labels names.txt", "class 1, but --labels has 1 name, 0 to 0"),
     ],
 )
 def test_what_was_found_before_an_error_is_kept(disc, outputs, options, said):

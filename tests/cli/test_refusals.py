@@ -131,7 +131,7 @@ REFUSED = {
         show front.json none.png => ^darswin: cannot read none.png: No such file[^(]*$
         show front.json front.png --out front.png => --out front.png would replace front.png
         info wrong.json => wrong.json
-        info front.json --image_size 960 => 2 whole numbers, got .*: height and width of the .* 960,1280
+        info front.json --image_size 960 => 2 whole numbers, got .*: height and width of .* 960,12
         info bare.json => lacks the size of its images: give --image_size, their height
         info front.json --coeficients x => the nearest option is --coefficients; see `darswin
         convert front.json front.json --model Mei => --out front.json would replace front.json
@@ -190,7 +190,7 @@ REFUSED = {
     "lens calibrate --board=6x5 --square=0.03 --model=Mei": r"""
         => missing pictures
         empty => no pictures or videos in empty
-        films => 0 of 0 pictures show the board of --board 6x5: .*$
+        films => 0 of 0 pictures with the board of --board 6x5: .*$
         none => no file or folder none
         boards --kind=round => --kind must be one of chessboard, charuco, april
         boards --kind=charuco => --kind charuco needs --marker
@@ -220,7 +220,7 @@ REFUSED = {
         even.png --fov_deg 180 => no image circle is visible
         even.png --model Sphericl => unknown lens model 'Sphericl'
         even.png --out even.png => --out even.png would replace even.png
-        even.png => only 0 curves may be straight lines, but an estimate needs 10
+        even.png => only 0 curves may be straight, but an estimate needs 10
     """,
     "fit --run r": r"""
         --data.path nowhere => no folder nowhere

@@ -315,7 +315,7 @@ def test_what_cannot_be_read_is_named_at_the_end(flat, capsys):
 
     said = refused(capsys, edited(flat, edit), WIDE)
     for words in (
-        "1 of 2 pictures were left out", "3 pictures and annotations of", "1.png has 9 × 400,",
+        "left out: 1 of 2 pictures", "left out: 3 of the", "1.png has 9 × 400,",
         "no picture no.png", "annotation 1 has the box", "annotation 2 has the category 9",
     ):  # fmt: skip
         assert words in said
@@ -411,7 +411,7 @@ def test_a_view_that_sees_nothing_of_the_lens(flat, capsys, monkeypatch):
     behind = make_view("mercator", (64, 64), fov=0.5, direction=(0, 0, -1))
     monkeypatch.setattr(module, "named_view", lambda *_, **options: behind)
     said = refused(capsys, flat, "mercator")
-    assert "3 of 3 pictures were left out" in said and said.count("\n") == 3
+    assert "left out: 3 of 3 pictures" in said and said.count("\n") == 3
     assert all(f"{k}.png: this view sees nothing of the lens" in said for k in range(3))
 
 
@@ -429,7 +429,7 @@ def test_grey_pictures_without_things(to, count, capsys):
     grey = cv2.imread("images/0.png", cv2.IMREAD_GRAYSCALE)
     cv2.imwrite("images/0.png", grey)
     file = warp(source, to)
-    assert f"{count} pictures of 1, with 0 instances" in capsys.readouterr().out
+    assert f"{count} from 1 of 1 picture, 0 instances" in capsys.readouterr().out
     assert json.loads(file.read_text())["annotations"] == []
     for new in Path("out/images").iterdir():
         assert cv2.imread(str(new), cv2.IMREAD_UNCHANGED).ndim == 2

@@ -91,7 +91,7 @@ SHIFTED = KannalaBrandt(
     ("lens", "sides"),
     [
         (WIDE, "157 px at the left and 157 px at the right of pictures of 966 × 1280 px"),
-        (upright(WIDE, 6), "157 px at the top and 157 px at the bottom of pictures of 1280 × 966 px"),
+        (upright(WIDE, 6), "157 px at the top and 157 px at the bottom of pictures of 1280 × 966"),
         (SHIFTED, "16 px at the left and 16 px at the right of pictures of 96 × 128 px"),
         (WIDE.cropped(0, 0, 966, 967), "0 px at the left and 1 px at the right of"),
     ],

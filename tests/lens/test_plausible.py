@@ -64,7 +64,7 @@ WRONG = [
     ((F, 5.2, -6.1), r"\(5.2, -6.1\), far from the middle; it may be measured from the middle$"),
     (scaled(2), r"the principal point at \(1930, 1066\), far .* would fit 21\d\d × 38\d\d px"),
     (scaled(1 / 2), r"far from the middle; .* would fit 53\d × 95\d px .*, or the picture is a cr"),
-    (scaled(1 / 4), r"far from the middle; .* would fit 2\d\d × 47\d px .*, or the picture is a cr"),
+    (scaled(1 / 4), r"far from the middle; .* would fit 2\d\d × 47\d px .*, or the picture is a c"),
     ((F, CX, CY, F, (W, H)), "; width and height seem to be swapped"),
     ((F, 640, 480, F, (1280, 960)), "; width and height seem to be swapped"),
     ((F, 640, 512, F, (1280, 1024)), "; width and height seem to be swapped"),

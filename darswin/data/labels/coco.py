@@ -39,7 +39,7 @@ from darswin.data.splits import some
 from darswin.utils.files import replace_file
 from darswin.utils.image import read_header
 from darswin.utils.text import read_json
-from darswin.utils.words import in_px
+from darswin.utils.words import counted, in_px
 
 _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",
         "visible"}  # fmt: skip
@@ -92,7 +92,7 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
     folder = Path(pictures) if pictures is not None else _folder(path, files)
     there = [(folder / file).is_file() for file in files]
     if missing := [file for file, is_there in zip(files, there, strict=True) if not is_there]:
-        text = f"{len(missing)} of {len(files)} pictures of {path} are not in {folder}"
+        text = f"{path}: {len(missing)} of {counted(len(files), 'picture')} missing in {folder}"
         if len(missing) == len(files):
             raise FileNotFoundError(f"{text}: {some(missing)}")
         wrong += [f"{path}: there is no picture {file} in {folder}" for file in missing]

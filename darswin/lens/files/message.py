@@ -33,7 +33,7 @@ def in_message(
     if size is not None:
         size = size[0] // down, size[1] // across
         if 0 in size:
-            raise ValueError(f"the binning of {down} × {across} px (H × W) leaves none of the image")
+            raise ValueError(f"the binning of {down} × {across} px (H × W) leaves no image")
     plane["cx"] = (plane["cx"] - left + 0.5) / across - 0.5
     plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
     for name, count in (("fx", across), ("fy", down), ("skew", across)):

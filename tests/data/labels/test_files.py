@@ -200,8 +200,8 @@ def pictures_with(**changes):
         ({"categories": [{"name": "dog"}]}, "lacks 'id'"),
         ({"images": [*IMAGES, IMAGES[0]]}, "lists a picture twice"),
         (pictures_with(width=81), "60 × 81, but it has 60 × 80 px"),
-        (pictures_with(width=60, height=80), "80 × 60, .* 60 × 80 px .*: its width and height are sw"),
-        ({"images": [{"file_name": "d.png", "id": 9}]}, r"1 of 1 pictures .*d\.png"),
+        (pictures_with(width=60, height=80), "80 × 60, .* 60 × 80 px .* are swapped"),
+        ({"images": [{"file_name": "d.png", "id": 9}]}, r"1 of 1 picture .*d\.png"),
     ],
 )
 def test_wrong_coco_files(tmp_path, changes, said):
