@@ -157,7 +157,8 @@ def from_curves(
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     tried = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
     fits = {name: fitted for name, fitted in tried.items() if fitted is not None}
-    form = min(fits, key=lambda name: fits[name][1], default=model) if model == "auto" else model
+    closest = min(fits, key=lambda name: fits[name][1], default=model)
+    form = closest if model == "auto" else model
     if form not in fits:
         raise CalibrationError(
             f"no {model} lens is close to what the lines show: give more pictures, or another model"
@@ -186,11 +187,11 @@ def from_curves(
         + f", and known to {spread:.1%} at any radius below"
     )
     ratio, oblong = math.exp(best.v[6]), raw.affine is not None
-    auto = "" if model == "auto" else ", and the model auto may be closer"
+    than = f", {closest} up to {fits[closest][1]:.1f} px" * (form != closest)
     few, disagree = (not fov and second.max() < SECOND[1]), (not fov and best.agree < AGREE)
     doubts = {
         DIFFERENT: unsure,
-        f"{form} is up to {error:.1f} px from what the lines show{auto}": error > OFF,
+        f"{form} is up to {error:.1f} px from what the lines show{than}": error > OFF,
         f"pixels are not square: {ratio:.3f} along x is 1 along y, as the lens has it": oblong,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,

@@ -51,8 +51,8 @@ def calibrate(
     calibrations. Pictures that cannot be read are named at the end; all others are used.
 
     Args:
-        pictures: pictures, videos, and folders of them. Of a video, the sharpest frames of 40 equal
-            parts are taken: hold the board still now and then.
+        pictures: pictures, videos, and folders of them. Of each of 40 equal parts of a video, the
+            sharpest of five frames is taken: hold the board still now and then.
         board: columns and rows, e.g. 9x6: a chessboard's inner corners, a ChArUco board's squares,
             or the tags of a grid.
         square: the side of a square, or of a tag, in metres or any other unit of length.

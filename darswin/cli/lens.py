@@ -216,7 +216,9 @@ def crop(
         note = _check_box(box, lens)
         lens = lens.cropped(*box)
     if size is not None:
-        lens = lens.resized(size)
+        before, lens = lens.image_size, lens.resized(size)
+        if lens.affine is not None and before is not None:
+            note += f"; {in_px(before[0])} became {in_px(size)}"
     write_lens(lens, out, format, note, file.supported())
 
 

@@ -307,10 +307,12 @@ def _write(
     wrong = [*data.wrong, *lost, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
     assert data.lenses is not None
-    cameras = listed(camera.name for camera in data.lenses.cameras)
+    cameras = listed(
+        one.calibration if is_json(one.calibration) else one.name for one in data.lenses.cameras
+    )
     print(f"pictures by {cameras}, as {settings['to']} sees them")
-    done, instances = len(data) - len(bad), counted(count, "instance")
-    print(f"{folder}: {len(pictures)} from {done} of {counted(len(data), 'picture')}, {instances}")
+    made, instances = counted(len(pictures), "picture"), counted(count, "instance")
+    print(f"{folder}: {made} of {len(data)}, with {instances}")
     large = sum(lost["fits_no_tile"] for lost in left)
     share = f"{LEAST_VISIBLE:.0%} of them"
     for number, what in (

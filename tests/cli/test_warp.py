@@ -235,7 +235,7 @@ def test_things_that_leave_are_reported(flat, capsys):
     assert set(left[0]) == {"file", "id", "category", "visible", "fits_no_tile"}
     assert max(one["visible"] for one in left) < 0.2 and not left[0]["fits_no_tile"]
     said = capsys.readouterr().out
-    assert f"{len(left)} instances have left the picture, because less than 20% of them" in said
+    assert f"{len(left)} instances left the picture, because less than 20% of them" in said
 
 
 def test_a_second_run_goes_on(flat, capsys):
@@ -324,8 +324,8 @@ def test_what_cannot_be_read_is_named_at_the_end(flat, capsys):
     assert [entry["id"] for entry in entries] == [3] and len(data) == 1
 
 
-@pytest.mark.parametrize(("shares", "said"), [((0.1, 0.15), "are too large for"),
-                                              ((0.1, 0), "have left")])  # fmt: skip
+@pytest.mark.parametrize(("shares", "said"), [((0.1, 0.15), "too large for"),
+                                              ((0.1, 0), "left")])  # fmt: skip
 def test_what_no_tile_shows_is_named_as_what_it_is(flat, capsys, monkeypatch, shares, said):
     def lost(instances, move):
         visible = (*shares, 0.0, 0.0)[len(calls) % 4]
@@ -391,7 +391,7 @@ def test_what_yolo_lists_in_vain_is_named(capsys):
     shape = {"kpt_shape": [2, 3], "names": ["hand"]}
     Path("in/data.yaml").write_text(yaml.safe_dump(shape | {"train": "train.txt"}))
     said = refused(capsys, "in", WIDE)
-    for words in ("3 pictures", "a.txt, line 1 must be", "b_1.txt has 1 labels", "not in in, ['C:"):
+    for words in ("out: 3 of", "a.txt, line 1 must be", "b_1.txt has 1 label,", "not in in, ['C:"):
         assert words in said
     assert Path("out/train.txt").read_text() == "./images/a.png\n"
     assert yaml.safe_load(Path("out/data.yaml").read_text())["kpt_shape"] == [2, 3]
@@ -429,7 +429,7 @@ def test_grey_pictures_without_things(to, count, capsys):
     grey = cv2.imread("images/0.png", cv2.IMREAD_GRAYSCALE)
     cv2.imwrite("images/0.png", grey)
     file = warp(source, to)
-    assert f"{count} from 1 of 1 picture, 0 instances" in capsys.readouterr().out
+    assert f"{count} picture{'s' * (count > 1)} of 1, with 0 instances" in capsys.readouterr().out
     assert json.loads(file.read_text())["annotations"] == []
     for new in Path("out/images").iterdir():
         assert cv2.imread(str(new), cv2.IMREAD_UNCHANGED).ndim == 2

@@ -28,6 +28,7 @@ from darswin.lens import (
 )
 from darswin.lens.files.load import Calibration
 from darswin.lens.plausible import doubts
+from darswin.views import make_view
 
 H, W = 1080, 1920
 F, CX, CY = 850.0, 965.0, 533.0  # px
@@ -94,9 +95,18 @@ def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     (Perspective(F, 1.57, image_size=(H, W)), "a θ_max of 89.95°"),
     (KannalaBrandt(F, [2.0, -0.1, 3.0], 1.0, image_size=(H, W)), r"change \d\d-fold, as after"),
     (BrownConrady(F, [9.0], 0.9, image_size=(H, W)), r"change \d\d-fold, as after"),
+    (Equidistant(2.1), "^0.037 px per degree, as if the lengths were in mm; they are in px$"),
 ])  # fmt: skip
 def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
     assert re.search(pattern, doubts(lens)[0]), doubts(lens)[0]
+
+
+def test_a_view_holds_a_lens_without_a_size_against_the_picture():
+    view = make_view("mercator", (8, 8))
+    with pytest.warns(ImplausibleLens, match="describes a picture of .* would fit in mm$"):
+        view.at(Equidistant(2.1, 1.5), (H, W))
+    with warnings.catch_warnings(action="error"):
+        view.at(Equidistant(F, 1.5), (H, W))
 
 
 def genuine():
@@ -171,7 +181,7 @@ def test_a_batch_is_doubted_lens_by_lens():
     lens = Equidistant([300.0, 0.9, 310.0], 1.6, image_size=(640, 640))
     assert [bool(doubt) for doubt in doubts(lens)] == [False, True, False]
     assert doubts(lens) == [doubts(lens[i])[0] for i in range(3)]
-    assert doubts(Equidistant([3.0, 4.0])) == ["", ""]  # without a picture
+    assert doubts(Equidistant([30.0, 40.0])) == ["", ""]  # without a picture
     rows = torch.tensor([[200.0, 0.0], [50.0, 300.0]], requires_grad=True)
     assert len(doubts(Equidistant(torch.tensor(9.0), center=rows, image_size=(9, 9)))) == 2
 
