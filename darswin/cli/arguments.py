@@ -17,6 +17,22 @@ import yaml
 from darswin.utils.nearest import nearest
 
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
+# What the same argument means in several commands, unless their docstrings say it.
+_TEXTS = {
+    "calib": "the calibration file of the camera, in any format that darswin.lens.load reads.",
+    "camera": "the name or number of the camera, if the calibration has several.",
+    "coefficients": "the distortion model of an OpenCV or ROS calibration that does not name it.",
+    "image_size": "height and width of the images in px, e.g. 960,1280, if the file lacks them.",
+    "theta_max_deg": "the largest incident angle of the lens, in degrees, where the last ring of a "
+    "partition ends. The default is the largest angle that the images show.",
+    "fov_deg": "the horizontal field of view of a view between the outer edges of a row, in "
+    "degrees. The default is all that the lens sees.",
+    "up": "the direction away from gravity, for views, as x right, y down and z forward of the "
+    "camera. The default is the top of the picture, 0,-1,0.",
+    "every": "the step between the frames of a video that are predicted; 1 predicts all.",
+    "rings": "the number of rings of the partition.",
+    "sectors": "the number of sectors of the partition.",
+}
 # Nobody names a folder so, but for a mistake.
 _OF_FILES = {".csv", ".jpeg", ".jpg", ".json", ".mp4", ".onnx", ".png", ".safetensors", ".txt",
              ".yaml", ".yml", ".zip"}  # fmt: skip
@@ -53,7 +69,8 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
     or, if their names are options, the one whose option is in `argv`, and otherwise that of "".
 
     Keyword-only parameters are options; the others are positional. The annotations define which
-    values are valid. The help consists of the docstring: its text and its section `Args`.
+    values are valid. The help consists of the docstring, its text and its section `Args`, and of
+    `_TEXTS`.
     """
     if isinstance(commands, dict) and "" in commands:
         commands = _by_option(commands, [word.partition("=")[0] for word in argv])
@@ -68,7 +85,7 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
         return
     text, _, section = (inspect.getdoc(commands) or "").partition("\nArgs:\n")
     parser = Parser(prog=prog, description=" ".join(text.split()).replace("%", "%%"))
-    texts = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
+    texts = _TEXTS | dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
     kinds = {}
     for name, parameter in inspect.signature(commands).parameters.items():
         kinds[name] = kind = _without_none(parameter.annotation)

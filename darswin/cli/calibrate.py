@@ -202,7 +202,7 @@ def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":
 class _Seen(NamedTuple):
     """What pictures show: the names and corners of those with the board; the names of those
     without; the brightest levels, (H, W, 1); doubts; errors of pictures that cannot be read; and
-    the files of the names, with the numbers of frames."""
+    the frames of videos by their names, (H, W, 1)."""
 
     names: list[str]
     corners: "np.ndarray"
@@ -210,18 +210,13 @@ class _Seen(NamedTuple):
     brightest: "np.ndarray"
     doubts: list[str]
     broken: "Broken"
-    files: dict[str, tuple[str, int | None]]
+    frames: dict[str, "np.ndarray"]
 
     def read(self, name: str) -> "np.ndarray":
         """The picture of a name as stored, (H, W, 3), RGB."""
-        from darswin.utils.image import as_stored, read_stored
-        from darswin.utils.video import read_frames
+        from darswin.utils.image import read_stored
 
-        file, number = self.files[name]
-        if number is None:
-            return read_stored(file)
-        frames = read_frames(file, every=max(1, number))
-        return next(as_stored(f.image, f.orientation) for f in frames if f.number == number)
+        return self.frames[name].repeat(3, 2) if name in self.frames else read_stored(name)
 
     @property
     def total(self) -> int:
@@ -230,26 +225,23 @@ class _Seen(NamedTuple):
 
 def _pictures(
     files: Sequence["File"], broken: "Broken", progress: Any
-) -> Iterator[tuple[str, str, int | None, "np.ndarray", int]]:
-    """Names, files, and numbers of frames; grey pictures as stored, and their orientations."""
+) -> Iterator[tuple[str, "np.ndarray", int]]:
+    """The names of pictures and of frames, their grey levels upright, and their orientations."""
     import cv2
 
-    from darswin.utils.image import as_stored, read_oriented
+    from darswin.utils.image import read_oriented
     from darswin.utils.video import frame_count, read_frames
 
-    for progress.done, file in enumerate(files):
-        name = file.name
+    for progress.done, (name, is_video) in enumerate(files):
         with broken.skipped():
-            if not file.is_video:
-                image, orientation = read_oriented(name, 1)
-                yield name, name, None, as_stored(image, orientation), orientation
+            if not is_video:
+                yield name, *read_oriented(name, 1)
                 continue
-            count = frame_count(name) or UNKNOWN
-            frames = read_frames(name, 1, max(1, count // (FRAMES * OF)))
+            step = (frame_count(name) or UNKNOWN) // (FRAMES * OF)
+            frames = read_frames(name, 1, max(1, step))
             while some := list(islice(frames, OF)):
                 best = max(some, key=lambda frame: cv2.Laplacian(frame.image, cv2.CV_64F).var())
-                image = as_stored(best.image, best.orientation)
-                yield f"{name}, frame {best.number}", name, best.number, image, best.orientation
+                yield f"{name}, frame {best.number}", best.image, best.orientation
 
 
 def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
@@ -259,6 +251,7 @@ def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
     from darswin.calibrate.boards import edge_width, shown_instead
     from darswin.calibrate.doubts import Note
     from darswin.cli.pictures import Broken
+    from darswin.utils.image import as_stored
 
     corners: dict[str, np.ndarray] = {}
     widths: dict[str, float] = {}
@@ -266,9 +259,9 @@ def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
     known: dict[int, str] = {}
     first, brightest, broken = "", np.zeros((1, 1, 1), np.uint8), Broken()
     doubts: list[str] = []
-    of: dict[str, tuple[str, int | None]] = {}
-    for name, file, number, image, orientation in _pictures(files, broken, progress):
-        of[name] = file, number
+    names, frames = {file.name for file in files}, dict[str, np.ndarray]()
+    for name, upright, orientation in _pictures(files, broken, progress):
+        image = as_stored(upright, orientation)
         if not known:
             first, brightest = name, np.zeros_like(image)
         if brightest.shape != image.shape:
@@ -285,6 +278,7 @@ def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
         if np.isnan(places).all():
             without[name] = shown_instead(image[:, way], board) if len(without) < TRIED else ""
             continue
+        frames |= {name: image} if name not in names else {}
         widths[name] = edge_width(image[:, way], places, board)
         brightest = np.maximum(brightest, image)
         if way.step < 0:  # a board is symmetric
@@ -303,7 +297,7 @@ def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
     found = np.array([*corners.values()])
-    return _Seen([*corners], found, [*without], brightest, doubts, broken, of)
+    return _Seen([*corners], found, [*without], brightest, doubts, broken, frames)
 
 
 def _listed(names: Collection[str]) -> str:

@@ -38,11 +38,8 @@ def show(
     """Draws a picture with its polar partition, its polar image, and an undistorted view.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         image: a picture of this camera.
         out: the file to write; its ending names the format: png, jpg, webp, tif, pdf or svg.
-        rings: the number of rings of the partition.
-        sectors: the number of sectors of the partition.
         samples: the numbers of samples in each patch along radius and azimuth, e.g. 10,10.
         spacing: the quantity that the rings divide into equal parts.
         view: the projection of the undistorted view: see `darswin lens undistort`.
@@ -52,10 +49,6 @@ def show(
         yaw_deg: the angle that the undistorted view looks to the right, in degrees.
         pitch_deg: the angle that the undistorted view looks up, in degrees.
         up: the direction away from gravity, for the undistorted view: see `darswin lens undistort`.
-        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
-            largest angle that the picture shows.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # Only `show` needs OpenCV and matplotlib, whose import takes a second.
     from darswin.utils.image import read_oriented
@@ -90,15 +83,8 @@ def info(
     A line says what looks wrong, such as lengths in another unit than pixels, and what would fit.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
-        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
-        rings: the number of rings of the partition.
-        sectors: the number of sectors of the partition.
-        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
-            largest angle that the images show.
         camera: the name or number of the camera, if the file has several. Without it, all
             cameras are listed.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     _check_partition(rings, sectors)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
@@ -145,16 +131,10 @@ def convert(
     """Converts a calibration to another format, or to another lens model.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
         model: the lens model to fit, a name of darswin.lens.MODELS. Terms that the model or the
             format cannot hold are left out; the command prints how far the lens then is from the
             given one. The default keeps the model.
-        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
-            largest angle that the images show.
-        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
         format: the format of the new file. The default is OpenCV for .xml, .yaml and .yml, but
             Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and for .json that
             of darswin, which can hold any lens.
@@ -191,17 +171,10 @@ def crop(
     """Writes the calibration of cropped or resized pictures. The pictures themselves are not read.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
         box: the part of the picture that is kept, as top, left, height and width in px, e.g.
             0,160,960,960. A box beyond the picture means padding.
         size: the height and width in px to which the picture, or its part, is then resized.
-        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
-            largest angle that the whole images show.
-        image_size: height and width of the whole images in px, e.g. 960,1280, if the file lacks
-            them.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
         format: the format of the new file, as for `darswin lens convert`.
     """
     if box is None and size is None:

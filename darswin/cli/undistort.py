@@ -69,8 +69,6 @@ def undistort(
             picture, turned with the view.
         theta_max_deg: the incident angle beyond which the view is black, in degrees. The default is
             that of the calibration file; if it has none, all of the picture is shown.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
     from darswin.cli.pictures import Broken, claim_folder, files_at, is_below, relative_names

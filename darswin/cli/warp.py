@@ -76,13 +76,7 @@ def warp(
             the labels, and the calibrations of WoodScape.
         size: height and width of the new pictures in px, e.g. 480,640. The default is the size of
             the new camera, and 512,512 for views.
-        fov_deg: the horizontal field of view of a view between the outer edges of a row, in
-            degrees. The default is all that the lens sees.
-        up: the direction away from gravity in the camera's frame, for views: x to the right, y
-            down, z forward. The default is the top of the picture, 0,-1,0.
         pictures: the folder of the pictures, if a COCO file does not lie where COCO has it.
-        camera: the name or number of the camera, if the calibration of --lens has several.
-        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         processes: the number of processes that work at the same time.
     """
     check("processes", processes, processes >= 1, "at least 1")
