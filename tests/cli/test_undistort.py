@@ -63,7 +63,7 @@ def run(folder, *options, source="in", calib="fisheye.yaml", out="out"):
 
 def test_a_perspective_view_is_that_of_opencv(folder, capsys):
     out = run(folder, "--fov", 100)  # an unambiguous beginning of --fov_deg
-    assert "1 of 1 files, perspective view, 100° across, 96 × 128 px" in capsys.readouterr().out
+    assert "1 of 1 file, perspective view, 100° across, 96 × 128 px" in capsys.readouterr().out
     camera = lenses.load(out / "lens.json", dtype=torch.float64)
     assert math.isclose(camera.focal.item(), 64 / math.tan(math.radians(50)))
     f, (x, y) = camera.focal.item(), camera.center_in()[0].tolist()

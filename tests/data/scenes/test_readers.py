@@ -119,7 +119,7 @@ def test_the_split_of_heal_swin(tmp_path):
     # Lists as OmniDet's: a test set whose labels are withheld.
     (tmp_path / "lists").mkdir()
     (tmp_path / "lists" / "test.txt").write_text("08234_FV.png\n")
-    said = r"1 pictures for 'test' .* not in .*08234_FV"
+    said = r"1 picture for 'test' missing .*08234_FV"
     missing(tmp_path, said, split="test", splits=tmp_path / "lists")
 
 
