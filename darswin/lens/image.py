@@ -79,7 +79,7 @@ class LensInImage(LensBatch):
             raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
         else:
             given, own = _image_size(number), size[0].tolist()
-            if not _same_shape(given, own) and _same_shape(given[::-1], own):
+            if not _same_shape(given, own, 0.02) and _same_shape(given[::-1], own, 0.02):
                 text = f"the size {in_px(given)} changes the proportions of {in_px(own)}"
                 warnings.warn(f"{text}, which {in_px(given[::-1])} keeps", stacklevel=2)
             before, size = size, self._sizes(given)
@@ -142,9 +142,10 @@ class LensInImage(LensBatch):
         return self.replace(center=center.expand(self.count, 2), image_size=size)
 
 
-def _same_shape(size: Sequence[int], other: Sequence[float]) -> bool:
-    """True if two sizes have the same ratio of sides, but for rounding."""
-    return abs(size[0] * other[1] - size[1] * other[0]) <= max(other)  # px times the other side
+def _same_shape(size: Sequence[int], other: Sequence[float], part: float = 0.0) -> bool:
+    """True if two sizes have the same ratio of sides, but for rounding, and a part of it."""
+    across, down = size[0] * other[1], size[1] * other[0]  # px times the other side
+    return abs(across - down) <= max(*other, part * down)
 
 
 def _plain(value: Any) -> Any:

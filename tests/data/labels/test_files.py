@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers import refused
+from PIL import ExifTags, Image
 from scenes import write_woodscape
 
 from darswin.boxes import Instances, encode_rle
@@ -207,6 +208,13 @@ def pictures_with(**changes):
 def test_wrong_coco_files(tmp_path, changes, said):
     with pytest.raises((ValueError, FileNotFoundError), match=said):
         read_coco(write(tmp_path, **changes)).labels(0)
+
+
+def test_sides_before_exif_turns_a_picture_are_told(tmp_path):
+    file, exif = write(tmp_path), Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("L", (80, 60)).save(tmp_path / "images" / "a.png", exif=exif)
+    refused("80 × 60 px .* when its EXIF orientation turns it", read_coco(file).labels, 0)
 
 
 def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):
