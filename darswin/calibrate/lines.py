@@ -57,7 +57,7 @@ class Estimate:
         spread: how far θ may be off, anywhere up to the rim, as a part of θ.
         curves: the number of curves that are straight with this lens.
         covered: the part of the radius, in [0, 1], on which they lie.
-        verdict: what supports the lens, in sentences; doubts: sentences on what does not.
+        verdict: what supports the lens, in one sentence; doubts: sentences on what does not.
     """
 
     lens: Lens
@@ -184,7 +184,7 @@ def from_curves(
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
         "{:.1f}° at the rim, between {:.1f}° and {:.1f}°".format(*np.degrees((rim, low, high)))
-        + f". At smaller radii, angles are known to {spread:.1%}"
+        + f", and known to {spread:.1%} at any radius below"
     )
     ratio, oblong = math.exp(best.v[6]), raw.affine is not None
     than = f", {closest} up to {fits[closest][1]:.1f} px" * (form != closest)
