@@ -4,7 +4,6 @@ import math
 
 from darswin.lens.files.fields import Fields, to_side
 from darswin.lens.image import Size
-from darswin.utils.words import in_px
 
 
 def in_message(
@@ -24,7 +23,7 @@ def in_message(
         if not (0 < width <= columns - left and 0 < height <= rows - top):
             raise ValueError(
                 "roi must be a part of the image of 1 pixel or more, or all 0, got "
-                f"{in_px((height, width))} at x {left}, y {top}"
+                f"{width}×{height} px at ({left}, {top})"
             )
         if size is not None:
             sides = size[0] / down, size[1] / across
@@ -33,7 +32,7 @@ def in_message(
     if size is not None:
         size = size[0] // down, size[1] // across
         if 0 in size:
-            raise ValueError(f"the binning of {down} × {across} px (H × W) leaves no image")
+            raise ValueError(f"the binning of {across}×{down} pixels leaves none of the image")
     plane["cx"] = (plane["cx"] - left + 0.5) / across - 0.5
     plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
     for name, count in (("fx", across), ("fy", down), ("skew", across)):
