@@ -69,6 +69,11 @@ class CalibratedLens:
     _vector: Tensor = field(repr=False)
     _joint: Tensor = field(repr=False)
 
+    @property
+    def noise(self) -> float:
+        """px: by `sigma`, the root mean square distance of corners, as `error` and `left_out`."""
+        return math.sqrt(2) * self.sigma
+
     def uncertainty(self, pixels: Any) -> Tensor:
         """(...,) px: the standard deviation of the pixel of a far point, along its worst direction.
 

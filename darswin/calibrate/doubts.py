@@ -10,6 +10,7 @@ from darswin.calibrate.inputs import LEAST_CORNERS, CalibrationError
 from darswin.calibrate.refine import OFF, SHARPEST
 from darswin.calibrate.steady import FEW, Steadiness
 from darswin.lens import Lens
+from darswin.utils.words import counted
 
 UNSURE, UNKNOWN = 0.1, 2.0  # degrees: the standard deviation of rays
 DISAGREE, APART = 3.0, 0.06  # times that by the noise, for pictures that differ; degrees
@@ -63,13 +64,13 @@ def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadine
     for d, k, i in worst[:SHOWN]:
         said.append(Note(f"corner {i + 1} of {found.names[k]} is {d:.3g} px off"))
     if len(worst) > SHOWN:
-        count = int(off.any(1).sum())
-        said.append(Note(f"{len(worst) - SHOWN} more corners are off, in {count} pictures"))
+        where = counted(int(off.any(1).sum()), "picture")
+        said.append(Note(f"{counted(len(worst) - SHOWN, 'more corner')} off, in {where}"))
     for k in (~used).nonzero()[:, 0].tolist():
         what = f"does not fit: half of its corners are {distance[k].nanmedian():.3g} px off"
         if found.rotations[k].isnan().any():
             count = int(seen[k].sum())
-            what = f"shows {count} corners; {LEAST_CORNERS}, not on one line, are needed"
+            what = f"shows {counted(count, 'corner')}; {LEAST_CORNERS}, not on one line, are needed"
         said.append(f"{found.names[k]} {what}")
     if steady.places < FEW:
         count = int(used.sum())
@@ -78,11 +79,11 @@ def doubts(found: CalibratedLens, seen: Tensor, middle: Tensor, steady: Steadine
     if found.left_out > GUESSED * max(found.sigma, SHARPEST):
         said.append(
             f"pictures that were left out are missed by {found.left_out:.3g} px, but the noise is "
-            f"{found.sigma:.2g} px: take more pictures"
+            f"{found.noise:.2g} px: take more pictures"
         )
     if found.sigma > BLURRED:
         said.append(
-            f"corners are {found.sigma:.2g} px off: the pictures are blurred, the board is bent, "
+            f"corners are {found.noise:.2g} px off: the pictures are blurred, the board is bent, "
             "or another model fits better"
         )
     far = middles.norm(dim=1)

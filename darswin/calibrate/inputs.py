@@ -10,6 +10,7 @@ from darswin.calibrate.refine import Views
 from darswin.calibrate.steady import places
 from darswin.utils.arrays import as_tensor
 from darswin.utils.parameters import check, naming
+from darswin.utils.words import in_px
 
 LEAST_CORNERS, LEAST_PICTURES = 8, 3
 
@@ -68,7 +69,7 @@ def usable_pictures(views: Views, size: tuple[int, int], names: list[str]) -> Te
         x, y = views.corners[k, i].tolist()
         raise CalibrationError(
             f"{names[k]} has a corner at ({x:.4g}, {y:.4g}), outside of a picture of "
-            f"{size[1]}×{size[0]} (W×H) px: all pictures must be of one size."
+            f"{in_px(size)}: all pictures must be of one size."
         )
     usable = _spans(views.board[:, :2], views.seen, 1e-4) & _spans(views.corners, views.seen, 1.0)
     if usable.sum() < LEAST_PICTURES:

@@ -26,6 +26,7 @@ from darswin.lens import OCam, fit, to_dict
 from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check
+from darswin.utils.words import counted, in_px
 
 MOST = 120  # curves of a picture that are used
 FEWEST = 10  # curves of all pictures that an estimate needs
@@ -114,8 +115,8 @@ def estimate(
         check("fov", fov, 0 < fov < 2 * math.pi, "above 0 and below 2π")
     sizes = {picture.shape[:2] for picture in pictures}
     if len(sizes) != 1:
-        found = ", ".join(f"{w} × {h}" for h, w in sorted(sizes)) or "no pictures"
-        raise ValueError(f"pictures must be of one camera and one size (W × H), got {found}")
+        found = ", ".join(map(in_px, sorted(sizes))) or "no pictures"
+        raise ValueError(f"pictures must be of one camera and one size, got {found}")
     if min(min(sizes)) < (least := boards.LEAST_SIDE):
         raise ValueError(f"pictures must have at least {least} × {least} px")
     circle = image_circle(pictures)
@@ -125,7 +126,8 @@ def estimate(
     for number, picture in enumerate(pictures, 1):
         found_curves.append(edges.curves(picture))
         if progress is not None:
-            progress(f"picture {number} of {len(pictures)}: {len(found_curves[-1])} curves")
+            found = counted(len(found_curves[-1]), "curve")
+            progress(f"picture {number} of {len(pictures)}: {found}")
     return from_curves(found_curves, sizes.pop(), model, center=center, fov=fov, circle=circle)
 
 
@@ -164,7 +166,8 @@ def from_curves(
     theta = raw.unproject(min(radius * last, raw.r_max.item()))
     tried = {name: _closest(name, raw, theta) for name in (model, *FORMS) if name != "auto"}
     fits = {name: fitted for name, fitted in tried.items() if fitted is not None}
-    form = min(fits, key=lambda name: fits[name][1], default=model) if model == "auto" else model
+    closest = min(fits, key=lambda name: fits[name][1], default=model)
+    form = closest if model == "auto" else model
     if form not in fits:
         raise CalibrationError(
             f"no {model} lens is close to what the lines show: give more pictures, or another model"
@@ -184,7 +187,8 @@ def from_curves(
     oriented = (second >= SECOND).sum()
     unsure = sigma > UNSURE * rim or spread > OPEN
     sets = "hardly set" if unsure else "set"
-    source = f"orthogonal directions in {oriented} of {len(curves)} pictures {sets} the scale"
+    where = f"{oriented} of {counted(len(curves), 'picture')}"
+    source = f"orthogonal directions in {where} {sets} the scale"
     verdict = (
         f"{len(best.normal)} straight curves over {covered:.0%} of the radius support this lens, "
         f"and {'the given field of view sets the scale' if fov else source}: "
@@ -192,11 +196,11 @@ def from_curves(
         + f", and within {spread:.1%} at smaller radii"
     )
     ratio, oblong = math.exp(best.v[6]), raw.affine is not None
-    auto = "" if model == "auto" else ", and the model auto may be closer"
+    than = f", {closest} up to {fits[closest][1]:.1f} px" * (form != closest)
     few, disagree = (not fov and second.max() < SEVERAL), (not fov and best.agree < AGREE)
     doubts = {
         DIFFERENT: unsure,
-        f"{form} is up to {error:.1f} px from what the lines show{auto}": error > OFF,
+        f"{form} is up to {error:.1f} px from what the lines show{than}": error > OFF,
         f"pixels are not square: {ratio:.3f} along x is 1 along y, as the lens has it": oblong,
         f"only {second.max()} lines of a picture have a second direction": few,
         f"only {best.agree:.0%} of the lines agree with orthogonal directions": disagree,
@@ -226,7 +230,7 @@ def _curve(lens: Lens, radius: float) -> np.ndarray:
 def _check(count: int) -> None:
     if count < FEWEST:
         raise CalibrationError(
-            f"only {count} curves may be straight lines, but an estimate needs {FEWEST}: "
+            f"only {counted(count, 'curve')} may be straight, but an estimate needs {FEWEST}: "
             "give more pictures, or some of rooms, houses or streets"
         )
 

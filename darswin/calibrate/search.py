@@ -37,6 +37,7 @@ from darswin.lens import MODELS, Lens
 from darswin.lens.base import unknown_model
 from darswin.lens.files.load import reach
 from darswin.utils.parameters import check, naming
+from darswin.utils.words import counted
 
 # What "auto" tries.
 CANDIDATES = (
@@ -382,7 +383,7 @@ def _find(
         before, used = used, typical <= OFF * sigma
         if used.sum() < LEAST_PICTURES:
             raise CalibrationError(
-                f"Only {int(used.sum())} pictures agree on one {model.__name__} lens."
+                f"Only {counted(int(used.sum()), 'picture')} fit one {model.__name__} lens."
             )
         if torch.equal(before, used) and not better[used].any():
             break

@@ -11,6 +11,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from darswin.train.runs import BestCheckpoint
 from darswin.train.task import TaskModule
+from darswin.utils.words import counted
 
 # Fewer steps do not teach a new model anything: AdamW moves a weight by about the learning rate in
 # each, so weights of about 0.02 need some tens of steps of 1e-3, and the cosine shrinks the last.
@@ -38,7 +39,7 @@ class Announce(Callback):
         held = f" and {len(loaders.dataset) - left_out['val']} validation" if loaders else ""
         say(
             f"{name} with {parameters:,} parameters; {count:,} training{held} pictures; "
-            f"{pl_module.steps_per_epoch:,} steps an epoch, {pl_module.steps:,} in all"
+            f"{counted(pl_module.steps_per_epoch, 'step')} an epoch, {pl_module.steps:,} in all"
         )
         if pl_module.weights is None and trainer.global_step == 0:
             for line in shortfalls(pl_module):
@@ -59,15 +60,15 @@ def shortfalls(task: TaskModule) -> list[str]:
     steps, found = task.steps, []
     if steps < FEW_STEPS:
         found.append(
-            f"{steps} steps are too few to learn from scratch, which takes {FEW_STEPS} at least: "
+            f"{counted(steps, 'step')} cannot teach a new model, which takes {FEW_STEPS} at least: "
             "take a smaller --data.batch_size, more --trainer.max_epochs, or --model.weights of a "
             "trained model; for classification, --config few has small batches and 40 epochs"
         )
     warmup = task.warmup_epochs * task.steps_per_epoch
     if 2 * warmup > steps:
         found.append(
-            f"the learning rate rises during {min(warmup, steps):g} of the {steps} steps: take a "
-            "smaller --model.warmup_epochs"
+            f"the learning rate rises during {min(warmup, steps):g} of {counted(steps, 'step')}: "
+            "take a smaller --model.warmup_epochs"
         )
     return found
 

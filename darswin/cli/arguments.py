@@ -17,6 +17,25 @@ import yaml
 from darswin.utils.nearest import nearest
 
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
+# What the same argument means in several commands, unless their docstrings say it.
+_TEXTS = {
+    "calib": "the calibration file of the camera, in any format that darswin.lens.load reads.",
+    "camera": "the name or number of the camera, if the calibration has several.",
+    "coefficients": "the distortion model of an OpenCV or ROS calibration that does not name it.",
+    "image_size": "height and width of the images in px, e.g. 960,1280, if the file lacks them.",
+    "theta_max_deg": "the largest incident angle of the lens, in degrees, where the last ring of a "
+    "partition ends. The default is the largest angle that the images show.",
+    "fov_deg": "the horizontal field of view of a view between the outer edges of a row, in "
+    "degrees. The default is all that the lens sees.",
+    "up": "the direction away from gravity, for views, as x right, y down and z forward of the "
+    "camera. The default is the top of the picture, 0,-1,0.",
+    "every": "the step between the frames of a video that are predicted; 1 predicts all.",
+    "rings": "the number of rings of the partition.",
+    "sectors": "the number of sectors of the partition.",
+}
+# Nobody names a folder so, but for a mistake.
+_OF_FILES = {".csv", ".jpeg", ".jpg", ".json", ".mp4", ".onnx", ".png", ".safetensors", ".txt",
+             ".yaml", ".yml", ".zip"}  # fmt: skip
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
@@ -50,7 +69,8 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
     or, if their names are options, the one whose option is in `argv`, and otherwise that of "".
 
     Keyword-only parameters are options; the others are positional. The annotations define which
-    values are valid. The help consists of the docstring: its text and its section `Args`.
+    values are valid. The help consists of the docstring, its text and its section `Args`, and of
+    `_TEXTS`.
     """
     if isinstance(commands, dict) and "" in commands:
         commands = _by_option(commands, [word.partition("=")[0] for word in argv])
@@ -65,7 +85,7 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
         return
     text, _, section = (inspect.getdoc(commands) or "").partition("\nArgs:\n")
     parser = Parser(prog=prog, description=" ".join(text.split()).replace("%", "%%"))
-    texts = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
+    texts = _TEXTS | dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
     kinds = {}
     for name, parameter in inspect.signature(commands).parameters.items():
         kinds[name] = kind = _without_none(parameter.annotation)
@@ -91,7 +111,10 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
             try:
                 given[name] = _value(text, kinds[name])
             except (ValueError, KeyError, yaml.YAMLError):
-                parser.error(f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}")
+                meaning = " ".join(texts.get(name, "").split()) * _is_list(kinds[name])
+                first = re.split(r"\.(?= [A-Z]|$)", meaning)[0]  # of its sentences
+                said = f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}"
+                parser.error(": ".join(filter(None, (said, first))))
     commands(**given)
 
 
@@ -120,6 +143,17 @@ def check_out(
     for name in inputs:
         if all(map(os.path.isfile, (name, out))) and os.path.samefile(name, out):
             raise ValueError(f"--{option} {out} would replace {name}, which this command reads")
+
+
+def check_out_folder(folder: Path, option: str = "out") -> None:
+    """Raises ValueError if a folder to write to is or seems to be a file, or cannot be written."""
+    text = f"--{option} must be a folder"
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{text}, but {folder} is a file")
+    if not folder.exists() and folder.suffix.lower() in _OF_FILES:
+        raise ValueError(f"{text}, but {folder} has the ending of a file: leave it out")
+    if not can_write(folder.absolute()):
+        raise ValueError(f"{text} that can be written, got {folder}")
 
 
 def can_write(path: Path) -> bool:
@@ -177,13 +211,9 @@ def _kind(kind: Any) -> str:
     choices = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
         return f"one of {', '.join(choices)}"
-    if typing.get_origin(kind) is tuple and choices[0] is int:
-        return f"{len(choices)} whole numbers, such as {','.join(['10'] * len(choices))}"
-    if typing.get_origin(kind) is tuple:
-        return f"{len(choices)} numbers, such as {','.join(['0.5'] * len(choices))}"
     if _is_list(kind):
-        lists = {int: "whole numbers, such as 1,8", float: "numbers, such as 0.5,1"}
-        return lists.get(choices[0], "a list of texts")
+        many = {int: "whole numbers", float: "numbers"}.get(choices[0], "a list of texts")
+        return f"{len(choices)} {many}" if typing.get_origin(kind) is tuple else many
     return _WORDS.get(kind, "a text")
 
 

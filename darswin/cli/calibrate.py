@@ -5,7 +5,8 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
@@ -14,16 +15,17 @@ import darswin.lens
 from darswin.cli.arguments import check_out
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
-from darswin.lens.files.save import is_held
+from darswin.lens.files.save import format_of, is_held
 from darswin.utils.exif import TURNS
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
+from darswin.utils.words import counted, in_px
 
 if TYPE_CHECKING:
     import numpy as np
 
     from darswin.calibrate import Board, CalibratedLens
-    from darswin.cli.pictures import Broken
+    from darswin.cli.pictures import Broken, File
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 Kind = Literal["chessboard", "charuco", "april"]
@@ -31,6 +33,8 @@ LEAST = 3  # pictures
 BLURRED = 4.0, 1.6  # px, and by the median of all boards: the width of edges
 TRIED = 5  # pictures that are looked at again to say what is wrong
 LISTED = 10  # pictures that are named
+FRAMES, OF = 40, 5  # of a video; frames of which the sharpest is taken
+UNKNOWN = 1200  # frames, for videos that do not say how many they have
 
 
 def calibrate(
@@ -42,12 +46,13 @@ def calibrate(
 ) -> None:  # fmt: skip
     """Makes the calibration of a camera from pictures of a board, for any field of view to 250°.
 
-    It takes 10 to 20 pictures in which the board is tilted, at several distances, and everywhere in
-    the picture, also at its rim. Pixels are those that the camera stores, as in all calibrations.
-    Pictures that cannot be read are named at the end; the calibration is made from all others.
+    It takes 10 to 20 pictures, or a video, in which the board is tilted, at several distances, and
+    everywhere in the picture, also at its rim. Pixels are those that the camera stores, as in all
+    calibrations. Pictures that cannot be read are named at the end; all others are used.
 
     Args:
-        pictures: pictures, and folders of them. Videos are not read.
+        pictures: pictures, videos, and folders of them. Of each of 40 equal parts of a video, the
+            sharpest of five frames is taken: hold the board still now and then.
         board: columns and rows, e.g. 9x6: a chessboard's inner corners, a ChArUco board's squares,
             or the tags of a grid.
         square: the side of a square, or of a tag, in metres or any other unit of length.
@@ -87,21 +92,22 @@ def calibrate(
         figure_format(picture)
     if theta_max_deg is not None:
         check("theta_max_deg", theta_max_deg, 0 < theta_max_deg <= 180, "above 0, at most 180")
-    names = [file.name for file in files_at(pictures) if not file.is_video]
+    files = files_at(pictures)
+    names = [file.name for file in files]
     outs = {"out": out, "picture": picture, "report": report}
-    for option, file in outs.items():
-        (check_lens_out if option == "out" else check_out)(file, names, option)
+    check_lens_out(out, names, format)
+    for option in ("picture", "report"):
+        check_out(outs[option], names, option)
     written = [os.path.realpath(file) for file in outs.values() if file is not None]
     if len({*written}) < len(written):
         raise ValueError("--out, --picture and --report must be different files")
-    if not names:
-        raise ValueError(
-            "missing pictures: give pictures of a board, or folders of them; videos are not read"
-        )
-    with Progress("corners", len(names)) as progress:
-        seen = _look(names, made, progress)
+    if not files:
+        raise ValueError("missing pictures: give pictures or videos of a board, or folders of them")
+    with Progress("corners", len(files)) as progress:
+        seen = _look(files, made, progress)
     if len(seen.names) < LEAST:
-        few = f"{len(seen.names)} of {seen.total} pictures show the board of --board {board}"
+        total = counted(seen.total, "picture")
+        few = f"{len(seen.names)} of {total} with the board of --board {board}"
         why = "; ".join([f"{few}: {LEAST} are needed, and 10 to 20 are better", *seen.doubts])
         raise ValueError("\n".join([why, *seen.broken.errors]))
     with Progress("calibrate") as progress:
@@ -124,11 +130,10 @@ def calibrate(
         write_lens(lens, f"{out}.json", "darswin", supported=found.supported)
         raise ValueError(f"{with_flags(error)}; this one is in {out}.json") from error
     if picture is not None:
-        from darswin.utils.image import read_stored
         from darswin.viz.calibration import draw_calibration
         from darswin.viz.plot import save_figure
 
-        save_figure(draw_calibration(found, lens, read_stored), picture)
+        save_figure(draw_calibration(found, lens, seen.read), picture)
         print(picture)
     if report is not None:
         entries = found.to_dict() | {"lens": darswin.lens.to_dict(lens), "no_board": seen.without}
@@ -138,16 +143,19 @@ def calibrate(
     seen.broken.report()
 
 
-def check_lens_out(out: str | None, inputs: Iterable[str], option: str = "out") -> None:
+def check_lens_out(out: str | None, inputs: Iterable[str], format: Format | None = None) -> None:
     """`check_out` of a calibration, which may replace a calibration, but no other file."""
-    check_out(out, inputs, option)
-    if out is not None and os.path.isfile(out) and os.path.getsize(out):
+    check_out(out, inputs)
+    if out is None:
+        return
+    if os.path.isfile(out) and os.path.getsize(out):
         try:
             Calibration.read(out)
         except ValueError as error:
             raise ValueError(
                 f"--out {out} would replace a file that is no calibration: give a new name"
             ) from error
+    format_of(out, format)
 
 
 def write_lens(
@@ -193,7 +201,8 @@ def _board(kind: Kind, board: str, square: float, **given: Any) -> "Board":
 
 class _Seen(NamedTuple):
     """What pictures show: the names and corners of those with the board; the names of those
-    without; the brightest levels, (H, W, 1); doubts; errors of pictures that cannot be read."""
+    without; the brightest levels, (H, W, 1); doubts; errors of pictures that cannot be read; and
+    the frames of videos by their names, (H, W, 1)."""
 
     names: list[str]
     corners: "np.ndarray"
@@ -201,20 +210,48 @@ class _Seen(NamedTuple):
     brightest: "np.ndarray"
     doubts: list[str]
     broken: "Broken"
+    frames: dict[str, "np.ndarray"]
+
+    def read(self, name: str) -> "np.ndarray":
+        """The picture of a name as stored, (H, W, 3), RGB."""
+        from darswin.utils.image import read_stored
+
+        return self.frames[name].repeat(3, 2) if name in self.frames else read_stored(name)
 
     @property
     def total(self) -> int:
         return len(self.names) + len(self.without)
 
 
-def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
+def _pictures(
+    files: Sequence["File"], broken: "Broken", progress: Any
+) -> Iterator[tuple[str, "np.ndarray", int]]:
+    """The names of pictures and of frames, their grey levels upright, and their orientations."""
+    import cv2
+
+    from darswin.utils.image import read_oriented
+    from darswin.utils.video import frame_count, read_frames
+
+    for progress.done, (name, is_video) in enumerate(files):
+        with broken.skipped():
+            if not is_video:
+                yield name, *read_oriented(name, 1)
+                continue
+            step = (frame_count(name) or UNKNOWN) // (FRAMES * OF)
+            frames = read_frames(name, 1, max(1, step))
+            while some := list(islice(frames, OF)):
+                best = max(some, key=lambda frame: cv2.Laplacian(frame.image, cv2.CV_64F).var())
+                yield f"{name}, frame {best.number}", best.image, best.orientation
+
+
+def _look(files: Sequence["File"], board: "Board", progress: Any) -> _Seen:
     import numpy as np
 
     from darswin.calibrate import find_corners
     from darswin.calibrate.boards import edge_width, shown_instead
     from darswin.calibrate.doubts import Note
     from darswin.cli.pictures import Broken
-    from darswin.utils.image import as_stored, read_oriented
+    from darswin.utils.image import as_stored
 
     corners: dict[str, np.ndarray] = {}
     widths: dict[str, float] = {}
@@ -222,28 +259,26 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
     known: dict[int, str] = {}
     first, brightest, broken = "", np.zeros((1, 1, 1), np.uint8), Broken()
     doubts: list[str] = []
-    for progress.done, name in enumerate(files):
-        image = None
-        with broken.skipped():
-            image = as_stored(*(read := read_oriented(name, 1)))
-        if image is None:
-            continue
+    names, frames = {file.name for file in files}, dict[str, np.ndarray]()
+    for name, upright, orientation in _pictures(files, broken, progress):
+        image = as_stored(upright, orientation)
         if not known:
             first, brightest = name, np.zeros_like(image)
         if brightest.shape != image.shape:
-            one, other = (f"{a.shape[1]}×{a.shape[0]}" for a in (brightest, image))
+            one, other = (in_px(a.shape[:2]) for a in (brightest, image))
             raise ValueError(
-                f"all pictures must have one size: {first} has {one} (W×H) px, {name} has {other}"
+                f"all pictures must have one size: {first} has {one}, {name} has {other}"
             )
         if (same := known.setdefault(hash(image.tobytes()), name)) is not name:
             doubts.append(Note(f"{name} shows the same as {same}, and is left out"))
             continue
         # Mirrored by the camera, whose pictures the others turn back.
-        way = slice(None, None, -1 if sum(TURNS[read[1]]) % 2 else 1)
+        way = slice(None, None, -1 if sum(TURNS[orientation]) % 2 else 1)
         places = find_corners(image[:, way], board)
         if np.isnan(places).all():
             without[name] = shown_instead(image[:, way], board) if len(without) < TRIED else ""
             continue
+        frames |= {name: image} if name not in names else {}
         widths[name] = edge_width(image[:, way], places, board)
         brightest = np.maximum(brightest, image)
         if way.step < 0:  # a board is symmetric
@@ -262,7 +297,7 @@ def _look(files: Sequence[str], board: "Board", progress: Any) -> _Seen:
     if blurred := [f"{name} ({px:.1f} px)" for name, px in widths.items() if px > least]:
         doubts.append(f"blurred, by the width of edges: {_listed(blurred)}")
     found = np.array([*corners.values()])
-    return _Seen([*corners], found, [*without], brightest, doubts, broken)
+    return _Seen([*corners], found, [*without], brightest, doubts, broken, frames)
 
 
 def _listed(names: Collection[str]) -> str:
@@ -293,8 +328,8 @@ def _summary(found: "CalibratedLens", seen: _Seen, doubts: Sequence[str]) -> str
     rows = [
         ("pictures", f"{int(found.used.sum())} of {seen.total}"),
         ("corners", f"{corners} of {found.weights.numel()}"),
-        ("noise", f"{found.sigma:.3f} px along x and y"),
-        ("left out", f"{found.left_out:.3f} px in pictures that were left out"),
+        ("noise", f"{found.noise:.3f} px, the root mean square distance of corners"),
+        ("left out", f"{found.left_out:.3f} px, the same in pictures that were left out"),
         ("supported", f"up to {math.degrees(found.supported):.1f}° from the axis"),
         ("unsure", f"{math.degrees(found.unsure):.2g}° of the rays up to there"),
         *(("note" if isinstance(doubt, Note) else "looks wrong", doubt) for doubt in doubts),

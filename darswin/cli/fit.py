@@ -64,6 +64,7 @@ from darswin.utils.parameters import check
 from darswin.utils.processes import end_with_failed_process
 from darswin.utils.tasks import Task
 from darswin.utils.text import read_text
+from darswin.utils.words import counted
 
 # What the libraries of several processes say if one of them has gone.
 _LOST = r"Connection (closed|reset) by|gloo|NCCL|TCPStore|Broken pipe"
@@ -295,7 +296,7 @@ class RunCLI(LightningCLI):
     def _run_subcommand(self, subcommand: str) -> None:
         super()._run_subcommand(subcommand)
         if broken := self.datamodule.broken():
-            print(f"{broken} pictures could not be read and were left out")
+            print(f"left out, because they cannot be read: {counted(broken, 'picture')}")
 
     def fit(self, **options) -> None:
         """Trains, holding the lock of the run's folder; Lightning calls it."""

@@ -16,6 +16,7 @@ from darswin.models.registry import list_pretrained
 from darswin.models.saving import load_model, read_card
 from darswin.ops import _module, cpu_capability
 from darswin.utils import extras
+from darswin.utils.words import counted
 
 BYTE_PRODUCTS = {
     "pairs": "as numbers of 16 bits", "fours": "by VNNI or dot products", "tiles": "by AMX",
@@ -30,7 +31,7 @@ def models() -> None:
     for name in list_pretrained():
         card = read_card(name)
         print(
-            f"{name}: {card.model} for {card.task}, {len(card.classes)} classes, "
+            f"{name}: {card.model} for {card.task}, {counted(len(card.classes), 'class')}, "
             f"images of {card.size}×{card.size} with {card.channels} channels, mean {card.mean}, "
             f"std {card.std}"
         )

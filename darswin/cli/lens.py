@@ -16,6 +16,7 @@ from darswin.lens.files.save import closest
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
 from darswin.utils.parameters import check
+from darswin.utils.words import in_px
 from darswin.views import PolarView
 from darswin.viz.report import describe
 
@@ -37,11 +38,8 @@ def show(
     """Draws a picture with its polar partition, its polar image, and an undistorted view.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         image: a picture of this camera.
         out: the file to write; its ending names the format: png, jpg, webp, tif, pdf or svg.
-        rings: the number of rings of the partition.
-        sectors: the number of sectors of the partition.
         samples: the numbers of samples in each patch along radius and azimuth, e.g. 10,10.
         spacing: the quantity that the rings divide into equal parts.
         view: the projection of the undistorted view: see `darswin lens undistort`.
@@ -51,10 +49,6 @@ def show(
         yaw_deg: the angle that the undistorted view looks to the right, in degrees.
         pitch_deg: the angle that the undistorted view looks up, in degrees.
         up: the direction away from gravity, for the undistorted view: see `darswin lens undistort`.
-        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
-            largest angle that the picture shows.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # Only `show` needs OpenCV and matplotlib, whose import takes a second.
     from darswin.utils.image import read_oriented
@@ -89,15 +83,8 @@ def info(
     A line says what looks wrong, such as lengths in another unit than pixels, and what would fit.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
-        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
-        rings: the number of rings of the partition.
-        sectors: the number of sectors of the partition.
-        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
-            largest angle that the images show.
         camera: the name or number of the camera, if the file has several. Without it, all
             cameras are listed.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     _check_partition(rings, sectors)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
@@ -131,10 +118,7 @@ def info(
 
 
 def _in_short(lens: Lens, doubt: str) -> str:
-    size = ""
-    if lens.image_size is not None:
-        height, width = (round(side) for side in lens.image_size[0].tolist())
-        size = f", {width} × {height} px"
+    size = "" if lens.image_size is None else f", {in_px(lens.image_size[0])}"
     wrong = f"; looks wrong: {doubt}" if doubt else ""
     return f"{type(lens).__name__}{size}, up to {math.degrees(lens.theta_max.item()):.2f}°{wrong}"
 
@@ -147,21 +131,15 @@ def convert(
     """Converts a calibration to another format, or to another lens model.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
         model: the lens model to fit, a name of darswin.lens.MODELS. Terms that the model or the
             format cannot hold are left out; the command prints how far the lens then is from the
             given one. The default keeps the model.
-        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
-            largest angle that the images show.
-        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
         format: the format of the new file. The default is OpenCV for .xml, .yaml and .yml, but
-            Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and else the JSON
+            Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and for .json that
             of darswin, which can hold any lens.
     """
-    check_lens_out(out, (calib,))
+    check_lens_out(out, (calib,), format)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
     note = ""
@@ -193,17 +171,10 @@ def crop(
     """Writes the calibration of cropped or resized pictures. The pictures themselves are not read.
 
     Args:
-        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
         box: the part of the picture that is kept, as top, left, height and width in px, e.g.
             0,160,960,960. A box beyond the picture means padding.
         size: the height and width in px to which the picture, or its part, is then resized.
-        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
-            largest angle that the whole images show.
-        image_size: height and width of the whole images in px, e.g. 960,1280, if the file lacks
-            them.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
         format: the format of the new file, as for `darswin lens convert`.
     """
     if box is None and size is None:
@@ -211,14 +182,16 @@ def crop(
     for name, sides in (("box", (box or ())[2:]), ("size", size or ())):
         for side in sides:
             check(name, side, 1 <= side <= 10**6, _SIDES)
-    check_lens_out(out, (calib,))
+    check_lens_out(out, (calib,), format)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""
     if box is not None:
         note = _check_box(box, lens)
         lens = lens.cropped(*box)
     if size is not None:
-        lens = lens.resized(size)
+        before, lens = lens.image_size, lens.resized(size)
+        if lens.affine is not None and before is not None:
+            note += f"; {in_px(before[0])} became {in_px(size)}"
     write_lens(lens, out, format, note, file.supported())
 
 
@@ -229,7 +202,7 @@ def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
     top, left, height, width = box
     rows, columns = (round(side) for side in lens.image_size[0].tolist())
     meets = -height < top < rows and -width < left < columns
-    picture = f"the picture of {columns} × {rows} px (W × H)"
+    picture = f"the picture of {in_px((rows, columns))}"
     check("box", box, meets, f"a part of {picture}")
     inside = min(top, left) >= 0 and top + height <= rows and left + width <= columns
     return "" if inside else f"; the box extends beyond {picture}, which means padding"

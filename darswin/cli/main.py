@@ -110,6 +110,8 @@ def main(argv: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, ImportError, FloatingPointError, MemoryError) as error:
         message = with_flags(error, command.flag_of)
+        if isinstance(error, OSError) and error.filename is not None:
+            message = f"{error.filename}: {error.strerror}"
         # A worker process puts its traceback into the message; only the last line is the error.
         if "Traceback" in message:
             message = message.strip().splitlines()[-1]

@@ -25,8 +25,9 @@ def read_names(path: str | Path) -> dict[int, str]:
     Raises:
         ValueError: the file holds no names, or two of one class.
     """
-    text, suffix = read_text(path), Path(path).suffix.lower()
+    suffix = Path(path).suffix.lower()
     try:
+        text = read_text(path)
         if is_json_file(path):
             names = _listed(parse_json(text))
         elif suffix in (".yaml", ".yml"):
@@ -35,8 +36,8 @@ def read_names(path: str | Path) -> dict[int, str]:
             names = _label_map(text)
         else:
             names = _listed([line.strip() or None for line in text.splitlines()])
-    except (ValueError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         text = f"`labels` must be a file with the names of classes, got {path}: {reason}; {_FORMS}"
         raise naming(ValueError(text), "labels") from error
     return names

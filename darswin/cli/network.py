@@ -33,6 +33,7 @@ from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import IGNORE
+from darswin.utils.words import counted, in_px
 from darswin.views import PlainView, Remap
 from darswin.views.floor import check_floor
 from darswin.viz.pixels import draw_instances, label_image, overlay, palette
@@ -55,9 +56,8 @@ class Boxes:
         """What is wrong if most boxes are none; warns if some are."""
         if not self.without_area:
             return None
-        text = (
-            f"{self.without_area} of {self.count} boxes of {network} have no area and are left out"
-        )
+        boxes = f"{self.without_area} of {counted(self.count, 'box')}"
+        text = f"{network}: left out, because they have no area, are {boxes}"
         if 2 * self.without_area <= self.count:
             warnings.warn(text, stacklevel=2)
             return None
@@ -118,8 +118,8 @@ class NetworkAnswers(Answers):
             pixels = Pixels(tuple(mean or (0.0,)), tuple(std or (1.0,)), pixels.channels)
         pixels = pixels._replace(channels=channels or pixels.channels)
         self.view = make(self.network.size, mean=pixels.mean, std=pixels.std)
-        sides = "×".join(map(str, reversed(self.network.size or ())))
-        self.shown = f" by the view {view or VIEW}{sides and f' of {sides} px (W×H)'}"
+        sides = f" of {in_px(self.network.size)}" if self.network.size else ""
+        self.shown = f" by the view {view or VIEW}{sides}"
         self._mean, self._std = (
             per_channel(name, getattr(self.view, name), self.channels) for name in ("mean", "std")
         )
@@ -151,7 +151,8 @@ class NetworkAnswers(Answers):
 
     def _said(self, pixels: Pixels) -> str:
         """What is read of the file, and what it is given."""
-        names = f", {len(self.network.names)} names of classes" if self.network.names else ""
+        count = len(self.network.names)
+        names = f", {counted(count, 'name')} of classes" if count else ""
         values = "uint8"
         if self.network.output == "image":
             mean, std = (",".join(f"{v:.4g}" for v in part) for part in (pixels.mean, pixels.std))
@@ -173,9 +174,9 @@ class NetworkAnswers(Answers):
         wanted = None if self.labels is None else max(self.labels) + 1
         outputs = [name for name, count in counts.items() if count == wanted or wanted is None]
         if not outputs:
-            counted = ", ".join(f"{count} in {name}" for name, count in counts.items())
+            found = ", ".join(f"{count} in {name}" for name, count in counts.items())
             text = f"`labels` names the classes 0 to {(wanted or 0) - 1}, but {network.path} gives"
-            raise naming(ValueError(f"{text} other numbers of classes: {counted}"), "labels")
+            raise naming(ValueError(f"{text} other numbers of classes: {found}"), "labels")
         return outputs
 
     def finish(self) -> str | None:
@@ -208,12 +209,9 @@ class NetworkAnswers(Answers):
 
     def _bound_to(self, size: tuple[int, int], lens: Lens) -> BoundView:
         if isinstance(self.view, PlainView) and size != self.network.size:
-            (height, width), (own_height, own_width) = size, self.network.size
-            text = (
-                f"the picture is {width}×{height}, but the network takes {own_width}×{own_height}"
-            )
+            text = f"the picture has {in_px(size)}, but the network {in_px(self.network.size)}"
             text += ": choose a view that resamples it"
-            text += "" if self.network.has_size else f", or give it by `size`, {height},{width}"
+            text += "" if self.network.has_size else ", or give it by `size`, {},{}".format(*size)
             raise naming(ValueError(text), "size")
         remap = self.view.at(lens, size)
         output = self.network.output
@@ -265,8 +263,8 @@ class NetworkAnswers(Answers):
         if self.labels is None:
             return self.network.names.get(label, label)
         if label not in self.labels:
-            count = f"{len(self.labels)} names, from {min(self.labels)} to {max(self.labels)}"
-            text = f"{self.network.path} found class {label}, but `labels` has {count}, without it"
+            names = f"{counted(len(self.labels), 'name')}, {min(self.labels)} to {max(self.labels)}"
+            text = f"{self.network.path} found class {label}, but `labels` has {names}, without it"
             raise naming(ValueError(text), "labels")
         return self.labels[label]
 

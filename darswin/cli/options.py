@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import yaml
 
-from darswin.cli.arguments import Parser, with_nearest
+from darswin.cli.arguments import Parser, check_out_folder, with_nearest
 from darswin.utils.nearest import did_you_mean
 from darswin.utils.tasks import Task
 from darswin.utils.text import read_text
@@ -43,6 +43,8 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     before = None
     if given.run:
         check_folder(Path(given.run), _TAKES)
+        if argv[0] == "fit":
+            check_out_folder(Path(given.run), "run")
         others += ["--run", given.run]
         own = Path(given.run) / "config.yaml"
         if argv[0] == "fit" and not given.resume:

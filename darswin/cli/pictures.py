@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from darswin.cli.arguments import can_write
+from darswin.cli.arguments import check_out_folder
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.lens import Lens
 from darswin.utils.files import check_is_file, remove_partial_files, replace_file
@@ -191,10 +191,7 @@ def claim_folder(out: str | None, record: str, settings: Mapping[str, Any] | Non
     if out is None:
         raise ValueError("missing --out: this model writes pictures; give a folder for them")
     folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out must be a folder, but {out} is a file")
-    if not can_write(folder.absolute()):
-        raise ValueError(f"--out must be a folder that can be written, got {out}")
+    check_out_folder(folder)
     content = json.loads(json.dumps(settings or []))
     try:
         before = json.loads((folder / record).read_bytes())

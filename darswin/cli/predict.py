@@ -24,6 +24,7 @@ from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_stream
+from darswin.utils.words import counted
 
 ANSWERS = "predictions.json"
 
@@ -60,11 +61,8 @@ def predict(
         model: in place of a run, the safetensors file of a model, or "digits", which comes with
             darswin. `darswin convert` makes such files from the authors' released weights; their
             classes are numbers.
-        camera: the name or number of the camera, if the calibration has several.
-        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         task: the task that the model must have. Another model is an error.
         top: the number of classes to list for each image. The default is 5.
-        every: the step between the frames of a video that are predicted; 1 predicts all.
         out: the JSON file to write; without it, classes are printed. For segmentation and
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
@@ -123,16 +121,10 @@ def predict_network(
             turned boxes; maps (B, K, H, W) of the size of the view or of a whole fraction of it; or
             numbers (B, K). It needs onnxruntime, of the extra onnx.
         lens: the calibration of the camera, or of several, as of models.
-        camera: the name or number of the camera, if the calibration has several.
-        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         view: what the network sees of the pictures, by its lens: the name of a view of
             `darswin.views`, such as mercator, panorama, none, or tiles:5, with the number of tiles.
             The default is mercator.
         size: height and width of the view in px, such as 512,512, if the network takes any size.
-        fov_deg: the horizontal field of view of the view between the outer edges of a row, in
-            degrees. The default is all that the lens sees.
-        up: the direction away from gravity, as x right, y down and z forward of the camera. The
-            default is the top of the picture, 0,-1,0.
         mean: of the normalization that the network expects, (pixel/255 - mean) / std, one number or
             one for each channel. The default is that of the form of a detector, which is printed,
             and else 0, also if only std is given.
@@ -155,7 +147,6 @@ def predict_network(
         format: what else to write of detections, beside predictions.json: coco writes coco.json,
             the results that pycocotools reads; yolo writes labels/NAME.txt, with class, box and
             score in each line.
-        every: the step between the frames of a video that are predicted; 1 predicts all.
         out: a folder that is new, empty, or from an earlier predict. It gets predictions.json and
             overlays/NAME.jpg with the detections, or maps/OUTPUT/NAME.npy. For a network without
             boxes and maps, the JSON file to write; without it, its numbers are printed.
@@ -224,8 +215,8 @@ def _predict(
     if out is not None and entries:
         print(_summary(entries, out, answers.shown))
     videos = any(file.is_video for file in files)
-    what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
-    count = f"no {what} for {len(broken.errors)} of {len(files)} {kind}:"
+    what, kind = ("complete prediction", "file") if videos else ("prediction", "picture")
+    count = f"no {what} for {len(broken.errors)} of {counted(len(files), kind)}:"
     broken.report(count if entries else "")
     return entries
 
@@ -234,8 +225,8 @@ def _summary(entries: Sequence[Mapping[str, Any]], out: str, shown: str) -> str:
     """How many pictures have predictions, and where; shown: what the network sees, in words."""
     pictures = [entry for entry in entries if "frames_per_second" not in entry]
     counts = [len(entry["detections"]) for entry in pictures if "detections" in entry]
-    text = f"{out}: {len(pictures)} picture{'s' * (len(pictures) != 1)}{shown}"
-    text += f", {sum(counts)} detection{'s' * (sum(counts) != 1)}" if counts else ""
+    text = f"{out}: {counted(len(pictures), 'picture')}{shown}"
+    text += f", {counted(sum(counts), 'detection')}" if counts else ""
     drawn = any("overlay" in entry for entry in pictures)
     return text + f"; {Path(out).parent / 'overlays'} shows them" * drawn
 

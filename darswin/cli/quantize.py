@@ -23,6 +23,7 @@ from darswin.train.tasks import TASKS
 from darswin.utils.parameters import check, with_flags
 from darswin.utils.progress import Progress
 from darswin.utils.text import read_text
+from darswin.utils.words import counted
 
 BATCH = 16
 
@@ -73,7 +74,7 @@ def quantize(
     save_model(path, quantized.state_dict(), card)
     whole = sum(isinstance(module, torch.nn.Linear) for module in model.modules())
     sizes = [file.stat().st_size / 2**20 for file in (weights, path)]
-    print(f"{path}: {len(layers)} of {whole} linear layers have 8 bits")
+    print(f"{path}: 8 bits in {len(layers)} of {counted(whole, 'linear layer')}")
     print(f"{sizes[0]:.1f} MiB → {sizes[1]:.1f} MiB")
     if not held:
         print("the run has no validation pictures to compare both models on")
@@ -124,7 +125,7 @@ def _comparison(
             kept += int((after == target)[valid].sum())
             same += int((before == after).sum())
     share = f"mean square change / variance: {results.share():.1e}"
-    yield f"{pictures} validation pictures: {share}"
+    yield f"{counted(pictures, 'validation picture')}: {share}"
     if task in ("classification", "segmentation"):
         yield (
             f"correct: {_percent(right, known)} before, {_percent(kept, known)} after; same "

@@ -16,6 +16,7 @@ from darswin.lens.files.load import reach
 from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, with_flags
+from darswin.utils.words import counted, in_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,8 +69,6 @@ def undistort(
             picture, turned with the view.
         theta_max_deg: the incident angle beyond which the view is black, in degrees. The default is
             that of the calibration file; if it has none, all of the picture is shown.
-        camera: the name or number of the camera, if the file has several.
-        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
     from darswin.cli.pictures import Broken, claim_folder, files_at, is_below, relative_names
@@ -114,7 +113,7 @@ def undistort(
         _write_lens(folder, written)
     if written:
         with_lens = f"; their calibration is {folder / LENS}" * (folder / LENS).exists()
-        print(f"{folder}: {len(written)} of {len(files)} files, {views.said}{with_lens}")
+        print(f"{folder}: {len(written)} of {counted(len(files), 'file')}, {views.said}{with_lens}")
     broken.report()
 
 
@@ -159,7 +158,7 @@ class _Views:
         # Without a θ_max in the file, the lens ends at the picture's sides, and corners see more.
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
-        self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
+        self._said.add(f"{fov_deg:.4g}° across, {in_px((height, width))}")
         remap = view.at(exact, size)
         return _Viewed(remap.sampler(), remap.camera)
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from darswin.lens import BrownConrady, Lens, Perspective
 from darswin.lens.files.load import reach
+from darswin.utils.nearest import did_you_mean
 from darswin.utils.parameters import check, naming
 from darswin.views import PixelView, list_views, make_view, turned
 from darswin.views.registry import flat_views, view_class
@@ -107,7 +108,8 @@ def named_view(
 ) -> PixelView:  # fmt: skip
     """The view NAME or NAME:COUNT of (H, W) that a `parameter` names, for networks."""
     name, colon, count = spec.partition(":")
-    check(parameter, name, name in list_views(), f"one of {', '.join(list_views())}")
+    meant = did_you_mean(name, list_views()).rstrip(".")
+    check(parameter, name + meant, name in list_views(), f"one of {', '.join(list_views())}")
     _check_fov_and_up(name, fov_deg, up)
     options: dict[str, Any] = {
         key: values[0] if len(values) == 1 else values

@@ -39,6 +39,7 @@ from darswin.utils.image import (
 from darswin.utils.parameters import check, naming, with_flags
 from darswin.utils.processes import die_with_parent
 from darswin.utils.progress import Progress
+from darswin.utils.words import counted
 from darswin.views import CameraView, PixelView, list_views
 from darswin.views.camera import picture_size
 
@@ -75,13 +76,7 @@ def warp(
             the labels, and the calibrations of WoodScape.
         size: height and width of the new pictures in px, e.g. 480,640. The default is the size of
             the new camera, and 512,512 for views.
-        fov_deg: the horizontal field of view of a view between the outer edges of a row, in
-            degrees. The default is all that the lens sees.
-        up: the direction away from gravity in the camera's frame, for views: x to the right, y
-            down, z forward. The default is the top of the picture, 0,-1,0.
         pictures: the folder of the pictures, if a COCO file does not lie where COCO has it.
-        camera: the name or number of the camera, if the calibration of --lens has several.
-        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
         processes: the number of processes that work at the same time.
     """
     check("processes", processes, processes >= 1, "at least 1")
@@ -306,21 +301,24 @@ def _write(
     wrong = [*data.wrong, *lost, *(text for new in warped for text in new.wrong)]
     count = sum(len(labels.instances) for _, labels in pictures)
     assert data.lenses is not None
-    cameras = listed(camera.name for camera in data.lenses.cameras)
+    cameras = listed(
+        one.calibration if is_json(one.calibration) else one.name for one in data.lenses.cameras
+    )
     print(f"pictures by {cameras}, as {settings['to']} sees them")
-    print(f"{folder}: {len(pictures)} pictures of {len(data) - len(bad)}, with {count} instances")
+    made, instances = counted(len(pictures), "picture"), counted(count, "instance")
+    print(f"{folder}: {made} of {len(data)}, with {instances}")
     large = sum(lost["fits_no_tile"] for lost in left)
     share = f"{LEAST_VISIBLE:.0%} of them"
     for number, what in (
-        (len(left) - large, f"have left the picture, because less than {share} is visible"),
-        (large, f"are too large for the tiles: none shows {share}, only several together"),
+        (len(left) - large, f"left the picture, because less than {share} is visible"),
+        (large, f"too large for the tiles: none shows {share}, only several together"),
     ):
         if number:
-            print(f"{number} instances {what}; {folder / LEFT} lists them")
+            print(f"{counted(number, 'instance')} {what}; see {folder / LEFT}")
     report: list[str] = []
     for texts, what in (
-        (bad, f"{len(bad)} of {len(data)} pictures were left out"),
-        (wrong, f"{len(wrong)} pictures and annotations of the labels were left out"),
+        (bad, f"left out: {len(bad)} of {counted(len(data), 'picture')}"),
+        (wrong, f"left out: {len(wrong)} of the pictures and annotations in the labels"),
     ):
         if texts:
             more = [f"and {len(texts) - _NAMED} more"] * (len(texts) > _NAMED)

@@ -49,9 +49,11 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
 
     Raises:
         ValueError: the checkpoint is damaged, or contains other objects, which are not executed,
-            or no tensors.
+            or no tensors; or the target has another ending.
     """
     source = Path(source)
+    if Path(target).suffix != ".safetensors":  # `read_state` tells files by it
+        raise ValueError(f"the target must end in .safetensors, got {os.fspath(target)}")
     checkpoint = read_pickle(source)
     # The tensors are copied, because safetensors does not accept tensors that share memory.
     state = {

@@ -23,6 +23,7 @@ from darswin.data.splits import (
 )
 from darswin.utils.parameters import naming
 from darswin.utils.video import SUFFIXES as VIDEOS
+from darswin.utils.words import counted
 
 SUFFIXES = frozenset((
     ".jpg", ".jpeg", ".jpe", ".jfif", ".insp", ".mpo", ".jps", ".png", ".bmp", ".dib", ".webp",
@@ -260,7 +261,7 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
     split_of = split_of_each(given, lists)
     if missing := _missing(root, split_of):
         raise FileNotFoundError(
-            f"{lists} lists {len(missing)} pictures that are not in {root}: {some(missing)}"
+            f"{lists} lists {counted(len(missing), 'picture')} missing in {root}: {some(missing)}"
         )
     return {split: Pictures(root, paths) for split, paths in given.items()}
 

@@ -11,6 +11,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles
 from darswin.utils.parameters import check
 from darswin.utils.tasks import IGNORE, Fit
+from darswin.utils.words import in_px
 from darswin.views import CropView, Remap
 from darswin.views.base import Pair
 from darswin.views.camera import picture_size
@@ -82,7 +83,7 @@ def cut_off(size: tuple[int, int], lens: Lens | None, fit: Fit) -> str | None:
         f"{a} px at the {one} and {b} px at the {other}" for one, a, other, b in ends if a or b
     ]
     share = 100 * lost.size / np.isfinite(theta).sum()
-    text = f"{' and '.join(parts)} of pictures of {size[1]}×{size[0]} px"
+    text = f"{' and '.join(parts)} of pictures of {in_px(size)}"
     if lens is None:
         return f"{text} ({share:.2g} % of their pixels)"
     first, last = (f"{math.degrees(angle):.0f}°" for angle in (lost.min(), lost.max()))

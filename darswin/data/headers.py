@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from darswin.data.samples import Samples
 from darswin.utils.image import BrokenImageError, Header
 from darswin.utils.progress import Progress
+from darswin.utils.words import counted
 
 SHOWN = 10  # faults in an error
 _READ = 8  # pictures that are read whole
@@ -38,7 +39,7 @@ def check_files(parts: Mapping[str, Samples]) -> dict[str, int]:
     if faults:
         count = sum(map(len, parts.values()))
         lines = [
-            f"{len(faults)} of {count} pictures cannot be used:",
+            f"{len(faults)} of {counted(count, 'picture')} cannot be used:",
             *map(str, faults[:SHOWN]),
         ]
         if len(faults) > SHOWN:

@@ -7,6 +7,8 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from darswin.data.samples import Draw
+from darswin.utils.parameters import naming
+from darswin.utils.words import counted
 
 
 class TrainingOrder(Sampler[Draw]):
@@ -29,10 +31,9 @@ class TrainingOrder(Sampler[Draw]):
         if world > 1 and batch % 2:
             raise ValueError(f"with several processes the batch of each must be even, got {batch}")
         if count < batch * world:
-            raise ValueError(
-                f"{count} images are too few for a batch of {batch} on each of {world} "
-                "processes: choose a smaller batch_size"
-            )
+            text = f"{counted(count, 'picture')} cannot fill a batch of {batch}"
+            text += f" on each of {world} processes" * (world > 1)
+            raise naming(ValueError(f"{text}: choose a smaller `batch_size`"), "batch_size")
         self.count, self.batch, self.rank, self.world = count, batch, rank, world
         self.pairs, self.seed = pairs, seed
         several = cameras is not None and len(np.unique(cameras)) > 1

@@ -13,6 +13,7 @@ from darswin.lens.parameter import Arguments, Number, Parameter, as_tensors
 from darswin.ops.checks import readable
 from darswin.utils.angles import degrees_hint
 from darswin.utils.arrays import as_tensor
+from darswin.utils.words import counted
 
 NUMBER = Parameter()
 
@@ -156,7 +157,7 @@ class LensBatch:
         if isinstance(index, Integral):
             number = int(index)
             if not -len(self) <= number < len(self):
-                raise IndexError(f"index {number} is out of range for {len(self)} lenses")
+                raise IndexError(f"index {number} is out of range for {counted(len(self), 'lens')}")
             number %= len(self)
             index = slice(number, number + 1)
         return self._map(lambda tensor: tensor[index])

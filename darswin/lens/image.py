@@ -1,6 +1,7 @@
 """The image of a lens: principal point, shape of the pixels, size, resizing and cropping."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -12,6 +13,7 @@ from darswin.lens.parameter import Parameter
 from darswin.lens.solve import solve
 from darswin.ops.checks import tensor_there
 from darswin.utils.arrays import as_tensor
+from darswin.utils.words import in_px
 
 Size = tuple[int, int] | None  # (H, W) px
 
@@ -62,6 +64,9 @@ class LensInImage(LensBatch):
             scale: the factor, above 0; or, for a lens with an `image_size`, the new (H, W) in whole
                 pixels, which is exact where the factor would be rounded.
 
+        Warns:
+            UserWarning: an (H, W) that looks like (W, H), which alone would keep the proportions.
+
         Raises:
             ValueError: a scale or side that is not positive, or an (H, W) for a lens without an
                 image_size. TypeError: neither a number nor (H, W).
@@ -75,7 +80,11 @@ class LensInImage(LensBatch):
         elif size is None:
             raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
         else:
-            before, size = size, self._sizes(_image_size(number))
+            given, own = _image_size(number), size[0].tolist()
+            if not _same_shape(given, own, 0.02) and _same_shape(given[::-1], own, 0.02):
+                text = f"the size {in_px(given)} changes the proportions of {in_px(own)}"
+                warnings.warn(f"{text}, which {in_px(given[::-1])} keeps", stacklevel=2)
+            before, size = size, self._sizes(given)
             down, across = (size / before).unbind(1)
         lens = self._scaled(across)
         lens.image_size = size
@@ -105,14 +114,14 @@ class LensInImage(LensBatch):
         """
         if self.image_size is None:
             return self
-        height, width = (round(side) for side in self.image_size[0].tolist())
-        off = abs(size[0] * width - size[1] * height)  # px times the other side
-        if off > width and off > height:
+        own = [round(side) for side in self.image_size[0].tolist()]
+        if not _same_shape(size, own):
+            turned = _same_shape(size[::-1], own)
             raise ValueError(
-                f"the calibration is for {width}×{height} (W×H) but the picture is "
-                f"{size[1]}×{size[0]}: crop or resize the lens too"
+                f"the calibration is for {in_px(own)}, but the picture has {in_px(size)}: "
+                + ("it looks turned by 90°, so turn it back" if turned else "crop the lens too")
             )
-        return self if tuple(size) == (height, width) else self.resized(size)
+        return self if list(size) == own else self.resized(size)
 
     def _scaled(self, scale: Tensor) -> Self:
         """The same lens with all its lengths multiplied by `scale`, (N or 1,)."""
@@ -133,6 +142,12 @@ class LensInImage(LensBatch):
         center = self.center_in() - self.theta_max.new_tensor([left, top])
         size = self._sizes((height, width))
         return self.replace(center=center.expand(self.count, 2), image_size=size)
+
+
+def _same_shape(size: Sequence[int], other: Sequence[float], part: float = 0.0) -> bool:
+    """True if two sizes have the same ratio of sides, but for rounding, and a part of it."""
+    across, down = size[0] * other[1], size[1] * other[0]  # px times the other side
+    return abs(across - down) <= max(*other, part * down)
 
 
 def _plain(value: Any) -> Any:

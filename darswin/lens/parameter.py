@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from darswin.utils.arrays import as_tensor
+from darswin.utils.nearest import add_meant
 
 Number = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
@@ -107,6 +108,7 @@ class Arguments:
             try:
                 self.signature.bind(*arguments, **named)  # its error describes the mistake
             except TypeError as error:
+                add_meant(error, self.known)
                 raise TypeError(f"{function}{self.signature}: {error}") from error
         return {name: value for name, value in bound.items() if value is not None}
 

@@ -8,6 +8,7 @@ import torch
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
 from darswin.lens.polynomial import PolynomialLens
+from darswin.utils.words import in_px
 
 # The thresholds lie far from real lenses. Their image circles are as large as the picture's shorter
 # side or larger, and half the diagonal spans 0.4 to 4 rad in pixels of the axis. Small circles in
@@ -29,6 +30,7 @@ UNITS = {"in mm": 1e3 / 3, "in cm": 1e4 / 3, "in m": 1e6 / 3, "in inches": 25.4e
 MOST_OFF = 2.5
 TYPICAL_SPANS = (0.15, 6.0)  # rad
 MOST_APART = 1.2  # ratio of the factors along x and y
+LEAST_SCALE, SMALL = 8.0, 0.1  # px per rad, by r at this θ
 LEAST_SIDE, MOST_SIDE = 64, 1e6  # px; a smaller "picture" is a sensor in a unit of length
 
 
@@ -41,14 +43,14 @@ def doubts(lens: Lens, missed: float = 0.0) -> list[str]:
 
     The image circle up to θ_max, the pixels per angle, θ_max and the principal point are held
     against the picture, and so are the px by which the calibration missed its corners, as far as
-    its file says. A lens without an image_size is not doubted.
+    its file says. A lens without an image_size is doubted only if no picture would fit it.
     """
-    if lens.image_size is None:
-        return [""] * len(lens)
     lens = lens.detach().to("cpu", torch.float64)
-    stretch = torch.ones(1) if lens.affine is None else lens.affine.det().abs().sqrt()
-    limit, small = lens.theta_limit, lens.theta_limit.clamp(max=0.1)
+    limit, small = lens.theta_limit, lens.theta_limit.clamp(max=SMALL)
     scale = lens.project(small) / small
+    if lens.image_size is None:
+        return [_tiny(px) for px in scale.tolist()]
+    stretch = torch.ones(1) if lens.affine is None else lens.affine.det().abs().sqrt()
     is_pinhole = (limit < math.pi / 2) & (lens.project(limit) > 10 * scale)
     rows = (lens.theta_max, stretch * lens.r_max, stretch * scale, is_pinhole, _change(lens),
             lens.center_in().flatten(1), lens.image_size)  # fmt: skip
@@ -95,8 +97,14 @@ def _doubt(
         oddities.insert(0, f"px per degree that change {change:.2g}-fold, as after a failed fit")
     if missed > MOST_MISSED:
         oddities.insert(0, f"corners that its calibration missed by {missed:.3g} px")
-    shown = f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(oddities)}{guess}"
+    shown = f"a picture of {in_px(size)} with {' and '.join(oddities)}{guess}"
     return shown if oddities else ""
+
+
+def _tiny(scale: float) -> str:
+    """What is said of a lens with so few px per rad that its lengths are no pixels."""
+    per_degree = f"{math.radians(scale):.2g} px per degree"
+    return f"{per_degree}, as if the lengths were in mm; they are in px" * (scale < LEAST_SCALE)
 
 
 def off_middle(x: float, y: float, width: float, height: float) -> float:
@@ -147,7 +155,7 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
     if x > 0 and y > 0 and MOST_APART > (ratio := width * y / height / x) > 1 / MOST_APART:
         factor = width / x / 2 / math.sqrt(ratio)  # from these lengths to px
         if LEAST_SIDE * factor < min(width, height) < MOST_SIDE * factor:
-            fit = f"the lengths would fit {width / factor:.0f} × {height / factor:.0f} px"
+            fit = f"the lengths would fit {in_px((height / factor, width / factor))}"
             return f"; {fit}, or the picture is a crop"
         if units := _nearest(UNITS, factor):
             return f"; the lengths would fit {units}"

@@ -1,12 +1,13 @@
 """Models by name. Each model's file registers its class in four sizes. The folder `weights` has the
 trained models that come with darswin."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
-from darswin.utils.nearest import did_you_mean
+from darswin.utils.nearest import add_meant, did_you_mean
 from darswin.views import View, make_view
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
@@ -84,7 +85,12 @@ def make(name: str, **options: Any) -> Model:
     options = preset(name) | options
     if isinstance(options.get("view"), Mapping):
         options["view"] = _view(options)
-    return _MODELS[name][1](**options)
+    kind, constructor, presets = _MODELS[name]
+    try:
+        return constructor(**options)
+    except TypeError as error:
+        add_meant(error, {*presets, *inspect.signature(kind).parameters})
+        raise
 
 
 def _view(options: dict[str, Any]) -> View:

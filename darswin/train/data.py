@@ -25,6 +25,7 @@ from darswin.lens.files.reader import Coefficients
 from darswin.train.runs import ignore_signals
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit
+from darswin.utils.words import counted
 
 SMALLEST = 32  # px, the size of images of smaller pictures
 
@@ -288,7 +289,7 @@ class RunData(LightningDataModule):
         part = range(place["rank"], count, place["world"])
         if not part:
             raise ValueError(
-                f"the {split!r} split has {count} pictures, too few for the processes of this run"
+                f"the {split!r} split has {counted(count, 'picture')}, fewer than processes"
             )
         return DataLoader(dataset, self.batch_size, sampler=part, **self._options)
 
@@ -339,6 +340,8 @@ class WideAngleData(RunData):
             if value is not None and self._lens is None:
                 text = f"`{name}` {value} needs a calibration: give `lens`"
                 raise naming(ValueError(text), name, "lens")
+        hint = f" ({fov_deg:g} radians are {math.degrees(fov_deg):.0f}°)" if fov_deg < 10 else ""
+        check("fov_deg", f"{fov_deg:g}°{hint}", 10 <= fov_deg < 180, "from 10° to below 180°")
         self.train_lenses = parse_lenses(train_lenses)
         self._test_lenses = parse_sweep(test_lenses)
         self._warping: dict[str, Any] = dict(

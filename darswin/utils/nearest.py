@@ -1,6 +1,7 @@
 """The known names that are most like a given one, for errors."""
 
 import difflib
+import re
 from collections.abc import Iterable
 
 LONGEST = 64  # characters that are compared
@@ -21,3 +22,10 @@ def did_you_mean(given: str, names: Iterable[str], count: int = 1, alike: float 
     similar. Arguments: see `nearest`."""
     found = nearest(given, names, count, alike)
     return f"; did you mean {' or '.join(found)}?" if found else "."
+
+
+def add_meant(error: TypeError, names: Iterable[str]) -> None:
+    """Adds the name that was probably meant to an error about an unknown keyword."""
+    text = str(error).partition(". Did you mean")[0]  # which Python adds from 3.13 on
+    if found := re.search(r"unexpected keyword argument '(\w+)'", text):
+        error.args = (text + did_you_mean(found[1], names),)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from darswin.utils.image import BrokenImageError
+from darswin.utils.words import counted
 
 SUFFIXES = frozenset((
     ".360", ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".insv", ".lrv", ".m2ts",
@@ -149,6 +150,12 @@ def frame_rate(path: str | Path) -> float:
     return rate if 0 < rate < math.inf else 25.0
 
 
+def frame_count(path: str | Path) -> int:
+    """The number of frames that a video file names; 0 if it names none."""
+    capture = _opened(path)
+    return 0 if capture is None else max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+
 def write_frames(path: str | Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Writes frames (H, W, 3) uint8, RGB, as a video (MPEG-4, no sound); without frames, nothing.
 
@@ -199,8 +206,8 @@ def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: fl
     last = length - min(_TOLERANCE, _PART * length)
     if end < last and _stored_end(path) + 1 / rate < last:
         raise BrokenImageError(
-            f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s; its "
-            f"header claims {length:.1f} s"
+            f"{path} is damaged or cut off: it ends after {counted(count, 'frame')}, at {end:.1f} "
+            f"s; its header claims {length:.1f} s"
         )
 
 

@@ -1,5 +1,6 @@
 """The views that a network sees as pixels, and the way from their pixels back to the images."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,8 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.lens import Lens
+from darswin.lens import ImplausibleLens, Lens
+from darswin.lens.files.load import reach
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, ray_channels, sample_at
+from darswin.lens.plausible import doubts
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, check_pair, tensor_there
 from darswin.views.base import (
@@ -54,8 +57,18 @@ class PixelView(View):
         self.size = size
 
     def at(self, lens: Lens | None, size: Pair) -> Remap:
-        """The map between this view and pictures of (H, W) of one lens. See `Remap`."""
-        return Remap(self, lens, size)
+        """The map between this view and pictures of (H, W) of one lens. See `Remap`.
+
+        Warns:
+            ImplausibleLens: a lens without an image_size does not fit pictures of this size.
+        """
+        remap = Remap(self, lens, size)
+        if lens is not None and lens.image_size is None:  # others are judged as they are read
+            sized = lens.detach().replace(image_size=lens.theta_max.new_tensor([remap.size]))
+            (doubt,) = doubts(sized.with_theta_max(reach(sized)))
+            if doubt:
+                warnings.warn(f"the lens describes {doubt}", ImplausibleLens, stacklevel=2)
+        return remap
 
     def to_rays(self, points: Tensor, lens: Lens, size: Pair) -> Tensor:
         """Pixels (N or 1, ..., 2) of the view → vectors (N, ..., 3) in the camera's frame; NaN

@@ -56,7 +56,7 @@ def draw_calibration(
         panels[name].set(aspect="equal", xticks=[], yticks=[], **limits)
     titles = {
         "corners": f"{int(counts.sum())} corners",
-        "residuals": f"residuals, noise {found.sigma:.2g} px",
+        "residuals": f"residuals, noise {found.noise:.2g} px",
         "map": "standard deviation\nof the projection",
         "curve": f"projection:\n{type(lens).__name__}",
     }

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.lens.base import Lens
+from darswin.lens.base import MARGIN, Lens
 from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS, Spacing
+from darswin.utils.words import in_px
 from darswin.views import PolarView
 from darswin.views.directions import sides
 
@@ -111,7 +112,7 @@ def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
     rows = [("model", type(lens).__name__)]
     rows += [(f"  {name}", _numbers(value[0])) for name, value in values.items()]
     rows += [
-        ("image", f"{image_size[1]} × {image_size[0]} px (width × height)"),
+        ("image", f"{in_px(image_size)}"),
         (
             "principal point",
             f"x {cx:.2f}, y {cy:.2f} px (pixel centres are integers)"
@@ -133,9 +134,9 @@ def _is_outside(lens: Lens, image_size: tuple[int, int]) -> bool:
 
 
 def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
-    angles = sides(lens, image_size).tolist()
-    left, top, right, bottom = angles
-    ends = zip(SIDES, angles, beyond_lens(lens, image_size).tolist(), strict=True)
+    angles, last = sides(lens, image_size), lens.theta_max.item()
+    left, top, right, bottom = angles.clamp(-last, last).tolist()  # beyond θ_max nothing is used
+    ends = zip(SIDES, angles.tolist(), beyond_lens(lens, image_size).tolist(), strict=True)
     corners = _corners(lens, image_size)
     if _is_outside(lens, image_size):
         corners = "on the row and the column of the principal point"
@@ -145,7 +146,7 @@ def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
                           f"{corners}"),
         ("θ at the sides", ", ".join(
             f"{side}: the lens ends before" if beyond else f"{side} {_degrees(angle)}"
-            for side, angle, beyond in ends)),
+            + " (beyond θ_max)" * (angle > last + MARGIN) for side, angle, beyond in ends)),
         ("θ limit", f"{_both(lens.theta_limit)}: r rises up to here"),
         ("θ_max", f"{_both(lens.theta_max)}: the rings end here, r = {lens.r_max.item():.1f} px"),
         ("outside sensor", f"{share:.1%} of the samples up to θ_max, with equal steps of θ"),
@@ -158,7 +159,9 @@ def _corners(lens: Lens, image_size: tuple[int, int]) -> str:
     widest = lens.with_theta_max(None).theta_and_direction(pixels, image_size)[0].tolist()
     if math.isnan(sum(widest)):
         return "the lens ends before the corners"
-    return f"{_degrees(max(widest[0] + widest[3], widest[1] + widest[2]))} between the corners"
+    beyond = " (beyond θ_max)" * (max(widest) > lens.theta_max.item() + MARGIN)
+    across = max(widest[0] + widest[3], widest[1] + widest[2])
+    return f"{_degrees(across)} between the corners{beyond}"
 
 
 def _density(lens: Lens) -> list[tuple[str, str]]:

@@ -15,6 +15,7 @@
 
 at::Tensor read_picture(const std::string& path) {
   std::ifstream file(path, std::ios::binary);
+  TORCH_CHECK(file.is_open(), path, " cannot be opened");
   std::string kind;
   int64_t width = 0, height = 0, largest = 0;
   file >> kind >> width >> height >> largest;
@@ -29,6 +30,7 @@ at::Tensor read_picture(const std::string& path) {
 
 int main(int count, char** arguments) try {
   TORCH_CHECK(count == 3, "usage: classify MODEL.pt2 PICTURE.ppm");
+  TORCH_CHECK(std::ifstream(arguments[1]).is_open(), arguments[1], " cannot be opened");
   const c10::InferenceMode guard;
   torch::inductor::AOTIModelPackageLoader model(arguments[1]);
   const at::Tensor picture = read_picture(arguments[2]);

@@ -26,6 +26,7 @@ int main(int count, char** arguments) try {
 
   const std::string path = arguments[2];
   std::ifstream file(path, std::ios::binary);
+  require(file.is_open(), path + " cannot be opened");
   std::string kind;
   uint16_t width = 0, height = 0, largest = 0;
   file >> kind >> width >> height >> largest;

@@ -211,7 +211,7 @@ def test_few_orthogonal_lines_are_a_doubt(of_second, askew, doubt):
 
 def test_too_little_evidence_is_refused_in_one_sentence():
     for curves in ([], [[]], [curves_of(LENSES["equidistant"], 1, 5, askew=0, bent=2)]):
-        said = "curves may be straight lines, but"
+        said = "may be straight, but"
         assert "\n" not in refused(said, from_curves, curves, SIZE, error=CalibrationError)
 
 
@@ -248,16 +248,16 @@ NOISE = np.random.default_rng(0).integers(0, 256, (64, 64)).astype(np.uint8)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"pictures": []}, "one size .* got no pictures"),
+    ({"pictures": []}, "one size, got no pictures"),
     ({"pictures": [np.zeros((20, 30), np.uint8), np.zeros((30, 20), np.uint8)]},
-     "got 30 × 20, 20 × 30"),
+     "got 20 × 30 px .*, 30 × 20 px"),
     ({"model": "Sphere"}, "unknown lens model 'Sphere'"),
     ({"fov": 7.0}, "`fov` must be above 0 and below 2π, got 7"),
     ({"fov": 2.0}, "no image circle is visible"),
-    ({}, "only 0 curves may be straight lines"),
+    ({}, "only 0 curves may be straight, but"),
     *(({"pictures": [NOISE[:height, :width]]}, "pictures must have at least 16 × 16 px")
       for height, width in ((0, 0), (0, 20), (1, 1), (15, 40))),
-    *(({"pictures": [NOISE[:height, :width]]}, "curves may be straight lines")
+    *(({"pictures": [NOISE[:height, :width]]}, "curves may be straight, but")
       for height, width in ((16, 16), (17, 40), (64, 64))),
 ])  # fmt: skip
 def test_wrong_arguments(arguments, message):

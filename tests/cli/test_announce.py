@@ -50,7 +50,7 @@ def test_the_size_of_a_training_its_end_and_what_is_next(tmp_path, capsys):
     said = capsys.readouterr().err.splitlines()
     sizes = "; 96 training and 96 validation pictures; 3 steps an epoch, 6 in all"
     assert said[0].endswith(sizes) and said[0].startswith("darswin_a_nano with ")
-    assert said[1].startswith("darswin: 6 steps are too few to learn from scratch, which takes 100")
+    assert said[1].startswith("darswin: 6 steps cannot teach a new model, which takes 100")
     best = checkpoint(run, "best")["callbacks"]
     (score,) = (state["best_model_score"] for name, state in best.items() if "val/top1" in name)
     assert (
@@ -61,7 +61,7 @@ def test_the_size_of_a_training_its_end_and_what_is_next(tmp_path, capsys):
     fit(run, "--resume")
     said = capsys.readouterr().err
     assert "finished at step 6" in said and "with more --trainer.max_epochs" in said
-    assert "too few" not in said
+    assert "cannot teach" not in said
 
 
 def test_a_used_up_time_limit_is_named(tmp_path, capsys):
@@ -77,10 +77,10 @@ def test_a_used_up_time_limit_is_named(tmp_path, capsys):
     ("steps", "warmup", "said"),
     [
         (100, 5, []),
-        (99, 0, ["99 steps are too few"]),
+        (99, 0, ["99 steps cannot teach"]),
         (1000, 50, []),
-        (1000, 50.1, ["the learning rate rises during 501 of the 1000 steps"]),
-        (10, 20, ["10 steps are too few", "rises during 10 of the 10 steps"]),
+        (1000, 50.1, ["the learning rate rises during 501 of 1,000 steps"]),
+        (10, 20, ["10 steps cannot teach", "rises during 10 of 10 steps"]),
     ],
 )
 def test_schedules_that_are_too_short(steps, warmup, said):
@@ -103,8 +103,8 @@ NUMBER = r"[\d.,–-]+"
 OURS = [
     r"epoch \d+, step \d+: train/loss ",
     rf"darswin_a_nano with {NUMBER} parameters; {NUMBER} training and {NUMBER} validation pictures",
-    r"darswin: \d+ steps are too few to learn from scratch",
-    r"darswin: the learning rate rises during 2 of the 2 steps: ",
+    r"darswin: \d+ steps cannot teach a new model",
+    r"darswin: the learning rate rises during 2 of 2 steps: ",
     r"--trainer\.max_steps -1 in place of 2$",
     r"finished at step [24], (best val/top1|no validation)",
     r"lenses +n +top1 \(%\) +95 % interval +top5 \(%\) +loss +most frequent class \(%\)$",

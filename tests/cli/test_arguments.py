@@ -54,6 +54,7 @@ def command_of(*argv):
             count: of 100%
                 of things.
             kind: of it.
+            sides: of it, e.g. 3,4. And more.
         """
         found.update(locals())
 
@@ -86,13 +87,16 @@ def test_a_function_gets_its_arguments(capsys):
         ("s", "the following arguments are required: --count"),
         ("--count 3", "the following arguments are required: source"),
         ("s --count x", "--count must be a whole number, got x"),
-        ("s --count 3 --sides 1,2,3", "--sides must be 2 whole numbers, such as 10,10, got [1,2"),
+        (
+            "s --count 3 --sides 1,2,3",
+            "--sides must be 2 whole numbers, got [1,2,3]: of it, e.g. 3",
+        ),
         ("s --count=", "--count must be a whole number, got nothing"),
         ("s --count 3 --rate x", "--rate must be a number, got x"),
         ("s --count 3 --kind c", "--kind must be one of a, b, got c"),
-        ("s --count 3 --sides 1,x", "--sides must be 2 whole numbers, such as 10,10, got 1,x"),
-        ("s --count 3 --up 0,a,1", "--up must be 3 numbers, such as 0.5,0.5,0.5, got 0,a,1"),
-        ("s --count 3 --shares a", "--shares must be numbers, such as 0.5,1, got a"),
+        ("s --count 3 --sides 1,x", "--sides must be 2 whole numbers, got 1,x: of it, e.g. 3,4; "),
+        ("s --count 3 --up 0,a,1", "--up must be 3 numbers, got 0,a,1"),
+        ("s --count 3 --shares a", "--shares must be numbers, got a"),
         ("s --count 3 --names [1]", "--names must be a list of texts, got [1]"),
         ("s --count 3 --names [", "--names must be a list of texts, got ["),
         ("s --count 3 --speed 2", "unrecognized arguments: --speed 2"),

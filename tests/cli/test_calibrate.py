@@ -17,6 +17,7 @@ from PIL import ExifTags, Image
 from darswin import lens
 from darswin.calibrate import Board, find_corners
 from darswin.cli.main import main
+from darswin.utils.video import write_frames
 
 TRUE = lens.KannalaBrandt(
     torch.tensor(100.0, dtype=torch.float64), (0.02, -0.004), math.radians(95),
@@ -72,6 +73,8 @@ def test_pictures_become_a_lens_a_figure_and_a_report(folder, capsys):
     printed = capsys.readouterr().out
     assert "pictures        9 of 10" in printed and "corners         270 of 270" in printed
     assert "no board found in boards/wall.png" in printed
+    noise, left_out = re.findall(r"^(?:noise|left out) +([\d.]+) px, the ", printed, re.M)
+    assert 0.8 < float(left_out) / float(noise) < 2  # in one unit
     assert "made.json: darswin, KannalaBrandt up to 9" in printed
     found = lens.load("made.json", dtype=torch.float64)
     assert_is_true(found)
@@ -137,6 +140,19 @@ def test_a_folder_as_people_have_it(folder, capsys, monkeypatch, orientation):
     assert_is_true(made)
     ((_, _, read),) = drawn
     np.testing.assert_array_equal(read("boards/4.png"), stored)
+
+
+def test_a_video_is_read_by_its_sharpest_frames(folder, capsys):
+    boards = [cv2.imread(str(file)) for file in sorted((folder / "boards").iterdir())]
+    blurred = [cv2.GaussianBlur(board, (0, 0), 3.0) for board in boards]
+    frames = [frame for a, b in zip(boards, blurred, strict=True) for frame in (b, b, a, b)]
+    write_frames("film.mp4", [*frames, *blurred[:1]], 10.0)
+    calibrate("film.mp4", *BOARD, "--picture=made.png", "--report=report.json")
+    assert "looks wrong     blurred" not in capsys.readouterr().out
+    assert_is_true(lens.load("camera.json", dtype=torch.float64))
+    names = json.loads((folder / "report.json").read_text())["names"]
+    assert len(names) > 5 and {int(name.split("film.mp4, frame ")[1]) % 4 for name in names} == {2}
+    assert cv2.imread("made.png").shape[1] == 1200
 
 
 def test_markers_are_found_in_pictures_that_the_camera_mirrors(folder, capsys):
@@ -216,18 +232,18 @@ def test_what_pictures_do_not_show_is_said_in_a_sentence(folder, capsys):
     some = [f"boards/{k}.png" for k in (0, 1)]
     line = refusal(capsys, *some, "--board=7x4", "--square=1")
     assert line.endswith(
-        "0 of 2 pictures show the board of --board 7x4: 3 are needed, and 10 to 20 are better; "
+        "0 of 2 pictures with the board of --board 7x4: 3 are needed, and 10 to 20 are better; "
         "no board found in boards/0.png, boards/1.png: they show 6x5 inner corners"
     )
     line = refusal(capsys, *some, *BOARD)
     assert line.endswith(
-        "2 of 2 pictures show the board of --board 6x5: 3 are needed, and 10 to 20 are better"
+        "2 of 2 pictures with the board of --board 6x5: 3 are needed, and 10 to 20 are better"
     )
     (folder / "broken.png").write_bytes((folder / "boards/0.png").read_bytes()[:2000])
     assert "cannot read broken.png" in refusal(capsys, *some, "broken.png", *BOARD)
     cv2.imwrite("large.png", np.zeros((360, 320), np.uint8))
     line = refusal(capsys, *some, "large.png", *BOARD)
-    assert "boards/0.png has 360×320 (W×H) px, large.png has 320×360" in line
+    assert "boards/0.png has 320 × 360 px (H × W), large.png has 360 × 320" in line
 
 
 @pytest.mark.slow

@@ -226,7 +226,7 @@ def test_what_is_broken_is_named_and_all_others_are_done(run, command, capsys):
     total = 2 + len(broken)
     if "predict" in COMMANDS[command]:
         assert f"darswin: no complete prediction for {len(broken)} of {total} files:\n" in said
-    assert "the calibration is for 96×64 (W×H) but the picture is 64×64" in said
+    assert "for 64 × 96 px (H × W), but the picture has 64 × 64" in said
 
 
 # -- folders, disks and keys ----------------------------------------------------------------------

@@ -61,7 +61,7 @@ def test_show_writes_a_figure(lens):
 
 def test_info_prints_what_the_lens_is(lens):
     said = lens("info front.json")
-    assert "1280 × 966 px" in said and "350.4, -17.5" in said
+    assert "966 × 1280 px" in said and "350.4, -17.5" in said
     said = lens("info front.json --theta_max_deg=60 --rings=8")
     assert "60.00° (1.04720 rad)" in said and "for 8 × 64 tokens" in said
 
@@ -100,7 +100,7 @@ def test_how_far_corners_support_a_lens_is_kept_and_shown(lens, shown):
 def test_a_box_beyond_the_picture_is_told(lens):
     for box, told in (("0,160,966,966", False), ("100,200,900,900", True), ("-1,0,9,9", True)):
         said = lens(f"crop front.json out.json --box={box}")
-        assert ("beyond the picture of 1280 × 966 px" in said) == told
+        assert ("beyond the picture of 966 × 1280 px" in said) == told
 
 
 def test_radians_in_place_of_degrees_are_told(shown, capsys):
@@ -112,7 +112,7 @@ def test_cameras_of_a_file_are_listed(lens):
     calib = FILES / "kalibr_tumvi.yaml"
     said = lens(f"info {calib}")
     assert "--camera" in said and "principal point" not in said
-    assert re.search(r"^  cam0 +KannalaBrandt, 512 × 512 px, up to \d", said, re.M)
+    assert re.search(r"^  cam0 +KannalaBrandt, 512 × 512 px \(H × W\), up to \d", said, re.M)
     assert re.search(r"^  cam1 ", said, re.M)
     said = lens(f"info {calib} --camera cam1")
     assert "cam1, of 2: cam0, cam1" in said and "principal point" in said
@@ -141,7 +141,7 @@ def test_terminals_without_utf8(monkeypatch, encoding):
     terminal.flush()
     printed = terminal.buffer.getvalue().decode(encoding)
     plain = encoding == "ascii"
-    size = "1280 x 966 px (width x height)" if plain else "1280 × 966 px (width × height)"
+    size = "966 x 1280 px (H x W)" if plain else "966 × 1280 px (H × W)"
     assert f"image           {size}" in printed.splitlines() and "theta_max" in printed
     assert ("deg" in printed) == plain
 

@@ -212,7 +212,9 @@ def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(capsys):
     write("p.png", np.zeros((*SIZE, 3), np.uint8))
     lens = WIDE | {"theta_max": 1.0}  # 88 px around (163, 117)
     (entry,) = predict("p.png --network n.onnx --labels names.json --view stereographic", lens)
-    assert "2 of 8 boxes of n.onnx have no area and are left out" in capsys.readouterr().err
+    assert (
+        "n.onnx: left out, because they have no area, are 2 of 8 boxes" in capsys.readouterr().err
+    )
     labels = [thing["label"] for thing in entry["detections"]]
     assert labels == ["inside", "cut", "half outside", "inside"]  # the best first
     kept = dict(zip(labels[:3], entry["detections"], strict=False))
@@ -255,7 +257,7 @@ def test_a_stream_ends_by_ctrl_c_with_its_predictions(disc, monkeypatch, capsys)
         assert Path("out", entry["overlay"]).is_file()
     assert speed["frames"] == 2 and speed["video"] == "rtsp://host/door"
     for lens in (json.dumps(WIDE | {"image_size": [9, 9]}), "."):
-        with pytest.raises(SystemExit, match=r"for 9×9|no calibration in") as error:
+        with pytest.raises(SystemExit, match=r"for 9 × 9|no calibration in") as error:
             main(["predict", *command.split(), "--lens", lens, "--out", "out"])
         assert "secret" not in str(error.value)
     assert "secret" not in capsys.readouterr().err
@@ -284,7 +286,7 @@ def test_what_a_network_needs(disc, monkeypatch):
     ):
         write_graph(Path("n.onnx"), size=size)
         known = "" if size[0] == 256 else "--size 256,256"
-        with pytest.raises(SystemExit, match=rf"p\.png .* is 320×240, .* takes 256×256: .*{said}"):
+        with pytest.raises(SystemExit, match=rf"p\.png .* 240 × 320 px .* 256 × 256 px .*{said}"):
             predict(f"p.png --network n.onnx --view none {known}")
         assert Path("out/predictions.json").read_text() == "[]"
     monkeypatch.setattr("darswin.frames.onnx.lack", lambda extra, modules: f"{modules[0]} missing")
@@ -295,7 +297,7 @@ def test_what_a_network_needs(disc, monkeypatch):
     ("outputs", "options", "said"),
     [
         ("nan boxes", "", r"no prediction for .*b\.png: .*n\.onnx computes NaN"),
-        ("named", "--labels names.txt", "class 1, but --labels has 1 names, from 0 to 0"),
+        ("named", "--labels names.txt", "class 1, but --labels has 1 name, 0 to 0"),
     ],
 )
 def test_what_was_found_before_an_error_is_kept(disc, outputs, options, said):

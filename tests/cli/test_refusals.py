@@ -1,14 +1,19 @@
-"""Misuse of every command: one sentence on stderr, exit code 2, and no file has changed."""
+"""Misuse of every command: one sentence on stderr, exit code 2, and no file has changed. And the
+messages of the page about them."""
 
 import json
 import re
 import shutil
+import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from lens_examples import FILES, FRONT
 
+from darswin import create_model, lens, load_model
 from darswin.cli.main import main
 from darswin.lens import Polynomial, to_dict
 from darswin.models.saving import ModelCard, save_model
@@ -17,11 +22,10 @@ from darswin.models.saving import ModelCard, save_model
 REFUSED = {
     "": r"""
         train => there is no command 'train'. The commands are fit,
-        lents => no command 'lents'; did you mean lens\? The commands are fit,
         models swin => unrecognized arguments: swin
         models --zzzzzz 2 => unrecognized arguments: --zzzzzz 2; see `darswin models --help`
         convert => the following arguments are required: source, target
-        convert none.pth out.safetensors => No such file or directory: 'none.pth'
+        convert none.pth out.safetensors => ^darswin: none.pth: No such file or directory$
         convert a b --fast => unrecognized arguments: --fast
         quantize --run r --tolerence 2 => the nearest option is --tolerance; see
         quantize --run . --pictures 0 => --pictures must be at least 1, got 0
@@ -31,10 +35,9 @@ REFUSED = {
     """,
     "predict": r"""
         none.png p.png a.mp4 --run . --lens lens.json => no file or folder none\.png, a\.mp4$
-        p.png --model m.safetensors --lens lens.json => No such file .*m\.safetensors
+        p.png --model m.safetensors --lens lens.json => ^darswin: m\.safetensors: No such file
         none.png --lens lens.json => give either --run, .* or --model, a safetensors file or one of
         p.png --model digits --run . => or --model, a safetensors file or one of digits
-        p.png --model digits => missing --lens: give the camera
         p.png --model digits --view mercator => --view is an option of --network$
         p.png --model digits --labels l.txt => --labels is an option of --network
         --lens lens.json --run . => missing pictures or videos
@@ -76,7 +79,6 @@ REFUSED = {
         n.onnx --view tiles:3 => count must be from 4 to 9, got 3
         n.onnx --view none --fov_deg 90 => 'none' has no option 'fov'
         n.onnx --fov_deg 0 => --fov_deg must be above 0° and at most 360° for a
-        n.onnx --mean 123.7 => --mean must be in parts of 255, at most 1 \(.*\), got 123.7
         n.onnx --std 58.395,57.12,57.375 => parts of 255, .* 0.229,0.224,0.225\), got 58.395
         n.onnx --mean 0.1,0.2 => mean.*per channel
         n.onnx --std 0 => --std must be above 0
@@ -84,8 +86,6 @@ REFUSED = {
         n.onnx --top 2 => --top is for the classes of pictures, but n.onnx is a model
         n.onnx --size 32,64 => --size must be 64,64 for n.onnx, got 32,64
         n.onnx --threshold nan => --threshold must be from 0 to 1, as scores are, got nan
-        n.onnx --threshold 30 => --threshold must be from 0 to 1, as scores are, got 30
-        n.onnx --labels gone.txt => gone.txt
         n.onnx --task distance => --task does not go with --network
         maps.onnx --form pose => --form must be one that its outputs may have, numbers, got pose
         n.onnx --height 2 => --height needs --up, the direction away from gravity
@@ -94,7 +94,6 @@ REFUSED = {
         n.onnx --height 2 --up=0,-1,0 --view square => no .*up
         maps.onnx --height 2 --up=0,-1,0 => --height is for boxes, but maps.onnx gives
         maps.onnx --format coco => --format is for detections, but maps.onnx is a network for maps
-        free.onnx => missing --size: free.onnx takes pictures of any size
         free.onnx --size 0,64 => --size must be at least 1,1, got \(0, 64\)
         bytes.onnx --std 0.2 => bytes.onnx takes pixels of uint8: leave --mean and --std
         gone.onnx => there is no file gone.onnx
@@ -125,11 +124,10 @@ REFUSED = {
     "lens": r"""
         draw front.json => invalid choice: 'draw'
         show => arguments are required: calib, image
-        show front.json square.png => for 1280×966 \(W×H\) but the picture is 40×40
         show front.json none.png => ^darswin: cannot read none.png: No such file[^(]*$
         show front.json front.png --out front.png => --out front.png would replace front.png
         info wrong.json => wrong.json
-        info bare.json => lacks the size of its images: give --image_size, their height
+        info front.json --image_size 960 => 2 whole numbers, got .*: height and width of .* 960,12
         info front.json --coeficients x => the nearest option is --coefficients; see `darswin
         convert front.json front.json --model Mei => --out front.json would replace front.json
         convert front.json p.png => --out p.png would replace a file that is no calibration
@@ -137,7 +135,7 @@ REFUSED = {
         crop front.json new.json --box 0,0,9,9 --size 0,9 => --size must be from 1 to .*, got 0
         crop front.json new.json --box 0,0,0,9 => --box must be from 1 to 1000000 px, got 0
         crop front.json new.json => missing --box or --size
-        crop front.json new.json --box=966,0,9,9 => --box must be a part of the picture of 1280 × 9
+        crop front.json new.json --box=966,0,9,9 => --box must be a part of the picture of 966 × 1
         crop front.json new.json --box=0,-9,9,9 => --box must be a part of the picture
         crop front.json new.json --box=1,2,3 => --box must be 4 whole numbers
         crop bare.json new.json --image_size 0,9 --size 9,9 => --image_size must be from 1 to 1000
@@ -186,7 +184,6 @@ REFUSED = {
     "lens calibrate --board=6x5 --square=0.03 --model=Mei": r"""
         => missing pictures
         empty => no pictures or videos in empty
-        films => missing pictures
         none => no file or folder none
         boards --kind=round => --kind must be one of chessboard, charuco, april
         boards --kind=charuco => --kind charuco needs --marker
@@ -216,10 +213,8 @@ REFUSED = {
         even.png --fov_deg 180 => no image circle is visible
         even.png --model Sphericl => unknown lens model 'Sphericl'
         even.png --out even.png => --out even.png would replace even.png
-        even.png => only 0 curves may be straight lines, but an estimate needs 10
     """,
     "fit --run r": r"""
-        --data.path nowhere => no folder nowhere
         --config elsewhere.yaml => no folder elsewhere
         --config none => none is neither a file nor a preset
         --config minute => did you mean minutes\? The presets are few, iccv2023, iccv2023_paper, min
@@ -230,11 +225,12 @@ REFUSED = {
         --config two_cores --task distance => distance, which has scenes_minutes
         --model darswin_a_small => is none; type --model.name darswin_a_small; `darswin fit --help`
         --model=darswin_a_small => darswin: --model takes a file of options, and darswin_a_small is
-        --data photos => type --data.path photos; `darswin fit --help` lists the options
         --trainer 3 => --trainer takes a file of options, and 3 is none; `darswin fit
     """,
     "fit --config minutes --data.path digits --run": r"""
         => ^darswin fit: argument --run: expected one argument; see `darswin fit --help`$
+        /proc/x => --run must be a folder that can be written, got /proc/x
+        a.json => --run must be a folder, but a.json has the ending of a file: leave it out
         done => done holds a run already: continue it with --resume
         best.safetensors => --run names .* best.safetensors is a file\. --model.weights takes a mo
         began/checkpoints/best.ckpt => this one belongs to the run began\. --ckpt_path takes
@@ -256,7 +252,6 @@ REFUSED = {
         r --devices many => error: --devices:
         r --data.pth x => ^error: unrecognized arguments: --data.pth x; the nearest option is --data
         r --data.lmit 3 --batch_size 2 => the nearest option is --data.limit, --data.batch_size;
-        r --epochs 3 => the nearest option is --trainer.max_epochs; `darswin fit --help`
         r --data.xi 0.3 => the nearest option is --xi;
         r --zzzzzz 3 => unrecognized arguments: --zzzzzz 3; `darswin fit --help` lists the opt
     """,
@@ -272,7 +267,6 @@ REFUSED = {
     "test --run": r"""
         best.safetensors => --run names .* best.safetensors is a file\. --model.weights takes a mo
         r => there is no run in r
-        trained => no model in trained yet
         began --task segmentation => began is a run of --task classification, not of segmentation
     """,
 }
@@ -283,6 +277,11 @@ ROWS = [
     for command, rows in REFUSED.items()
     for options, said in (row.split("=>") for row in rows.strip().split("\n"))
 ]
+# The rows of the page's tables: what is typed, and a part of what is said.
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "messages.md"
+TOLD = re.findall(r"^\| `(?:darswin )?(.+?)` \| `(.+?)` \| .+ \|$", PAGE.read_text(), re.M)
+OTHERS = [row for row in TOLD if "swapped" in row[0] or "(" in row[0]]  # calls, and what is done
+ROWS += [(typed, re.escape(said)) for typed, said in TOLD if (typed, said) not in OTHERS]
 COLMAP = "1 OPENCV_FISHEYE 96 64 40 40 48 32 0 0 0 0\n2 OPENCV_FISHEYE 96 64 30 30 48 32 0 0 0 0\n"
 SET = {
     "images": [{"id": 0, "file_name": "0.png", "height": 64, "width": 96}],
@@ -307,6 +306,9 @@ FILES_OF_TEXT = {
     "two/annotations/other.json": SET,
     "lists.json": {"images": []},
     "form.json": SET | {"images": [{"id": 0, "file_name": 5}]},
+    "set/swapped.json": SET | {"images": [SET["images"][0] | {"height": 96, "width": 64}]},
+    "mm.json": {"model": "Equidistant", "focal": 2.1, "theta_max": 1.5},
+    "yolo.pt": "",
     "set/outside.json": SET | {"images": [SET["images"][0] | {"file_name": "../../p.png"}]},
     "elsewhere.yaml": "data: {path: elsewhere}",
     "speed.yaml": "model: {speed: 3}",
@@ -332,7 +334,8 @@ def world(tmp_path_factory):
     pictures = dict.fromkeys(("p.png", "in/p.png", "out/p.png", "more/own/b.png"), noise)
     pictures |= {f"{name}/images/0.png": noise for name in ("set", "deep/set", "lone")}
     pictures |= {"even.png": np.full((90, 120, 3), 80, np.uint8)}
-    pictures |= {"front.png": np.zeros((483, 640, 3)), "square.png": np.zeros((40, 40, 3))}
+    sizes = {"front.png": (483, 640, 3), "turned.png": (640, 483, 3), "square.png": (40, 40, 3)}
+    pictures |= {name: np.zeros(size) for name, size in sizes.items()}
     for name, picture in pictures.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(folder / name), picture)
@@ -368,8 +371,8 @@ def state_of(folder):
 
 @pytest.mark.parametrize(("command", "said"), ROWS)
 def test_misuse_is_one_sentence(world, request, monkeypatch, capsys, command, said):
-    for fixture in ("networks", "scenes"):
-        if fixture.removesuffix("s") in command:
+    for fixture, word in (("networks", ".onnx"), ("scenes", "scene")):
+        if word in command:
             request.getfixturevalue(fixture)
     if command.startswith(EARLY):
         monkeypatch.setattr("darswin.cli.main.resolve_name", None)  # it imports the command
@@ -382,3 +385,20 @@ def test_misuse_is_one_sentence(world, request, monkeypatch, capsys, command, sa
     line = printed.err.splitlines()[-1]  # after what a network is, and signs of life
     assert re.match("darswin|error: ", line) and re.search(said, line), line
     assert state_of(world) == before
+
+
+@pytest.mark.parametrize(("typed", "said"), OTHERS)
+def test_calls_and_commands_that_do_a_part_say_what_the_page_says(
+    world, monkeypatch, capsys, typed, said
+):
+    monkeypatch.chdir(world)
+    scope = dict(create_model=create_model, lens=lens, load_model=load_model, torch=torch)
+    heard: list[str] = []
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        try:
+            exec(typed, scope) if "(" in typed else main(typed.split())
+        except (Exception, SystemExit) as error:
+            heard.append(str(error))
+    heard += [str(warning.message) for warning in given] + [capsys.readouterr().err]
+    assert any(said in text for text in heard), heard

@@ -63,7 +63,7 @@ def run(folder, *options, source="in", calib="fisheye.yaml", out="out"):
 
 def test_a_perspective_view_is_that_of_opencv(folder, capsys):
     out = run(folder, "--fov", 100)  # an unambiguous beginning of --fov_deg
-    assert "1 of 1 files, perspective view, 100° across, 128 × 96 px" in capsys.readouterr().out
+    assert "1 of 1 file, perspective view, 100° across, 96 × 128 px" in capsys.readouterr().out
     camera = lenses.load(out / "lens.json", dtype=torch.float64)
     assert math.isclose(camera.focal.item(), 64 / math.tan(math.radians(50)))
     f, (x, y) = camera.focal.item(), camera.center_in()[0].tolist()
@@ -106,12 +106,12 @@ def test_the_views_show_all_that_the_picture_shows_by_default(folder, capsys):
     lens = Equidistant(50.0, image_size=SIZE)  # 146.7° in the row of the principal point
     (folder / "own.json").write_text(json.dumps(to_dict(lens) | {"theta_max": 64 / 50}))
     for view, fov, size in (
-        ("perspective", 100, "128 × 96 px"),
-        ("cylindrical", 146.7, "128 × 64 px"),
-        ("equirectangular", 146.7, "128 × 96 px"),
-        ("mercator", 146.7, "128 × 96 px"),
-        ("stereographic", 146.7, "128 × 96 px"),
-        ("panorama", 360, "128 × 43 px"),
+        ("perspective", 100, "96 × 128 px"),
+        ("cylindrical", 146.7, "64 × 128 px"),
+        ("equirectangular", 146.7, "96 × 128 px"),
+        ("mercator", 146.7, "96 × 128 px"),
+        ("stereographic", 146.7, "96 × 128 px"),
+        ("panorama", 360, "43 × 128 px"),
         ("square", 146.7, "96 × 96 px"),
     ):
         run(folder, f"--view={view}", calib="own.json", out=view)

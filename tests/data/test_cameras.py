@@ -46,7 +46,7 @@ def test_one_calibration_is_of_all_pictures(root):
     assert lenses.lens_of(None, SIZE) is lenses.lens_of(None, SIZE)  # read once
     assert lenses.cameras_of([None, root / "a/0.png"]).tolist() == [0, 0]
     same(lenses.lens_of(root / "a/0.png", SIZE[::-1], 6), upright(expected, 6))
-    said = r"0\.png: the calibration is for 1280×966 .*woods"
+    said = r"0\.png: the calibration is for 966 × 1280 .*woods"
     refused(said, lenses.lens_of, root / "a/0.png", (100, 100))
 
 

@@ -189,8 +189,8 @@ def test_pictures_and_videos_below_a_folder(tmp_path):
         ({"train": ["../a/1.jpg"]}, "must list paths CLASS/…"),
         ({"train": ["a/1.jpg"], "val": ["./a/1.jpg"]}, r"lists a/1\.jpg for 'train' and for 'val'"),
         ({"test": ["a//2.jpg"], "train": ["a/2.jpg"]}, "lists a/2.jpg for 'test' and for 'train'"),
-        ({"train": ["a/1.jpg", "a/7.jpg"]}, r"lists 1 pictures that are not in .*: \['a/7\.jpg'\]"),
-        ({"train": ["a/1.jpg"], "val": ["c/1.jpg"]}, r"lists 1 pictures .*: \['c/1\.jpg'\]"),
+        ({"train": ["a/1.jpg", "a/7.jpg"]}, r"lists 1 picture missing in .*: \['a/7\.jpg'\]"),
+        ({"train": ["a/1.jpg"], "val": ["c/1.jpg"]}, r"lists 1 picture .*: \['c/1\.jpg'\]"),
         ({"train": ["a/1.jpg"], "valid": ["b/1.jpg"]}, r"\['b'\], but the training split lacks"),
     ],
 )

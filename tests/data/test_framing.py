@@ -90,9 +90,9 @@ SHIFTED = KannalaBrandt(
 @pytest.mark.parametrize(
     ("lens", "sides"),
     [
-        (WIDE, "157 px at the left and 157 px at the right of pictures of 1280×966 px"),
-        (upright(WIDE, 6), "157 px at the top and 157 px at the bottom of pictures of 966×1280 px"),
-        (SHIFTED, "16 px at the left and 16 px at the right of pictures of 128×96 px"),
+        (WIDE, "157 px at the left and 157 px at the right of pictures of 966 × 1280 px"),
+        (upright(WIDE, 6), "157 px at the top and 157 px at the bottom of pictures of 1280 × 966"),
+        (SHIFTED, "16 px at the left and 16 px at the right of pictures of 96 × 128 px"),
         (WIDE.cropped(0, 0, 966, 967), "0 px at the left and 1 px at the right of"),
     ],
 )
@@ -111,7 +111,7 @@ def test_a_crop_of_what_no_ray_reaches_loses_nothing():
     circle = Equidistant(30.0, theta_max=1.5, image_size=(96, 128))  # 90 px wide
     assert cut_off((96, 128), circle, "crop") is None
     assert cut_off((96, 96), SHIFTED.cropped(0, 0, 96, 96), "crop") is None
-    whole = "16 px at the top and 16 px at the bottom of pictures of 96×128 px (25 % of their "
+    whole = "16 px at the top and 16 px at the bottom of pictures of 128 × 96 px (H × W) (25 % "
     assert cut_off((128, 96), None, "crop").startswith(whole)  # of an unknown lens all counts
 
 

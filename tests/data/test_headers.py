@@ -118,7 +118,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
     assert first == said and len(lines) == 11 and lines[-1] == "  and 1 more"
     assert all(str(source.file(k)) in "".join(lines) for k in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11))
     said = r"13 of 20 .*\n(.*\n){10}  and 3 more$"
-    assert "the calibration is for 40×30" in refused(said, check_files, {"photos": calibrated})
+    assert "the calibration is for 30 × 40" in refused(said, check_files, {"photos": calibrated})
     of_lenses, calibrated = of_photos(source, skip_broken=True)
     assert check_files({"a": of_lenses}) == {"a": 11}
     refused("2 of 20 pictures cannot be used", check_files, {"photos": calibrated})
@@ -173,16 +173,16 @@ def writing(array, bits=8):
     ("name", "change", "said"),
     [
         ("images/001.png", CHANGES["empty"], "cannot read"),
-        ("images/001.png", CHANGES["another shape"], r"images/001\.png.* 30×30"),
+        ("images/001.png", CHANGES["another shape"], r"images/001\.png.* 30 × 30"),
         ("images/001.png", turned, "has the EXIF orientation 6"),
-        ("labels/001.png", writing(LABELS[:-1]), r"has 120×160 px, .*images/001\.png has 121×160"),
+        ("labels/001.png", writing(LABELS[:-1]), r"120 × 160 px .*images/001\.png has 121 × 160"),
         ("labels/001.png", CHANGES["empty"], "cannot read"),
         ("labels/001.png", CHANGES["cut in the middle"], "cannot read"),
         ("labels/001.png", CHANGES["missing"], "cannot read"),
-        ("distance/001.png", writing(LABELS[:-1], 16), "has 120×160 px, "),
+        ("distance/001.png", writing(LABELS[:-1], 16), "has 120 × 160 px .*, "),
         ("distance/001.png", CHANGES["missing"], "cannot read"),
         ("distance/001.png", CHANGES["cut at the end"], "cannot read"),
-        ("distance/001.npy", saving(METRES[:-1]), "has 120×160 px, "),
+        ("distance/001.npy", saving(METRES[:-1]), "has 120 × 160 px .*, "),
         ("distance/001.npy", saving(METRES[None]), r"\(H, W\), but holds float32 \(1,"),
         ("distance/001.npy", saving(LABELS.astype(int)), "but holds int64"),
         ("distance/001.npy", saving(np.array([[{}]])), "cannot read"),

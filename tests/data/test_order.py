@@ -90,7 +90,7 @@ def test_a_loader_goes_on_where_it_was(cameras):
 
 def test_what_does_not_match():
     refused("must be even", order_of, 30, 5, world=2)
-    refused("7 images are too few", order_of, 7, 4, world=2)
+    refused("7 pictures cannot fill a batch of 4 on each of 2 processes", order_of, 7, 4, world=2)
     order = order_of(40, 8)
     said = r"global batch.*\(40, 4, 0\), got \(40, 8, 0\)"
     refused(said, order.resume, 0, 9, [40, 4, 0])

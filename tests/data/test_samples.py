@@ -161,7 +161,7 @@ def test_by_default_pictures_with_a_lens_are_kept_whole(folders, name):
     assert DATASETS[name](folders, fit="stretch").cut_off() is None
     lost = cropped.cut_off()
     assert (dataset.cut_off() is None) == calibrated
-    assert lost.startswith("19 px at the left and 20 px at the right of pictures of 160×121 px")
+    assert lost.startswith("19 px at the left and 20 px at the right of pictures of 121 × 160 px")
     assert ("off its axis" in lost) == calibrated
 
 

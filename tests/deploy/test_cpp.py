@@ -98,6 +98,8 @@ def test_classify_prints_the_class_or_one_sentence(programs, tmp_path):
         ([package, short], "short.ppm ends too early"),
         ([package, package], "model.pt2 is not a binary PPM or PGM file .*"),
         ([small, small], ".*zip archive.*"),
+        ([tmp_path / "none.pt2", small], "none.pt2 cannot be opened"),
+        ([package, tmp_path / "none.ppm"], "none.ppm cannot be opened"),
         ([], "usage: .*"),
     ):
         assert re.fullmatch(f"classify: .*{error}\n", told(*arguments)), arguments
@@ -138,6 +140,7 @@ def test_frame_prints_the_class_or_one_sentence(programs, tmp_path):
         ([network, picture], "frame must have the network's 1 channels, got 3"),
         ([maps, write_ppm(tmp_path / "b.ppm", pictures[0, 1:])], "the network is no classifier"),
         ([network, short], "short.ppm ends too early"),
+        ([network, tmp_path / "none.ppm"], "none.ppm cannot be opened"),
         ([network, network], "camera.safetensors is not a binary PPM or PGM file .*"),
         ([picture, picture], "a.ppm is no network that darswin.frames can read: .*"),
         ([tmp_path / "none.safetensors", picture], "none.safetensors: No such file or directory"),

@@ -130,7 +130,11 @@ def test_in_a_picture_of_the_same_view():
         assert found.image_size.tolist() == [list(size)]
         assert found.focal.item() == pytest.approx(300 * size[1] / 1280)
         assert (found is lens) == (size == (966, 1280))
-    for size in [(966, 1278), (480, 643), (1280, 966)]:
-        refused("calibration is for 1280×966", lens.in_picture, size)
+    for size, advice in [((966, 1278), "crop"), ((480, 643), "crop"), ((1280, 966), "turned")]:
+        said = rf"is for 966 × 1280 px \(H × W\), .* has {size[0]} × {size[1]} .*{advice}"
+        refused(said, lens.in_picture, size)
+    with pytest.warns(UserWarning, match="of 966 × 1280 px .*, which 480 × 640 px .* keeps"):
+        lens.resized((640, 480))
+    lens.resized((64, 64))  # as a network squeezes pictures: no mistake
     unknown = Equidistant(300.0, 1.5)
     assert unknown.in_picture((4, 9)) is unknown

@@ -307,7 +307,7 @@ def test_frames_of_instant_ngp_may_have_their_own_numbers():
 def test_the_order_of_a_size_beside_the_matrix_of_a_smaller_image():
     k = [[421.3, 0, 960.0], [0, 421.3, 540.0], [0, 0, 1]]
     for name, size in product(("img_size", "shape"), ((2160, 3840), (3840, 2160))):
-        with pytest.warns(ImplausibleLens, match="of 3840 × 2160 px .* would fit 19.. × 10.. px"):
+        with pytest.warns(ImplausibleLens, match="of 2160 × 3840 px .* would fit 10.. × 19.. px"):
             assert loads(sized(K=k, **{name: size})).image_size.tolist() == [[2160, 3840]]
 
 

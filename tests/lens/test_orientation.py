@@ -79,7 +79,7 @@ def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
     assert in_upright_picture(lens, (48, 64), 3).center.tolist() == [[23.0, 27.0]]
     assert in_upright_picture(lens, (24, 32), 3).center.tolist() == [[11.25, 13.25]]
     assert torch.equal(in_upright_picture(lens, (48, 64), 6).center, lens.center)
-    said = r"is 50×50: .* \(as stored; its EXIF orientation is 8"
+    said = r"has 50 × 50 px .* \(as stored; its EXIF orientation is 8"
     refused(said, in_upright_picture, lens, (50, 50), 8)
     refused("orientation must be 1 to 8, got 9", upright, lens, 9)
     refused("needs an image_size", upright, Equidistant(20.0), 6)

@@ -28,6 +28,7 @@ from darswin.lens import (
 )
 from darswin.lens.files.load import Calibration
 from darswin.lens.plausible import doubts
+from darswin.views import make_view
 
 H, W = 1080, 1920
 F, CX, CY = 850.0, 965.0, 533.0  # px
@@ -62,9 +63,9 @@ WRONG = [
     ((F / W, CX / W, CY / H, F / H), "the lengths would fit normalised by the width and height$"),
     ((F / W, CX / W - 0.5, CY / W - 0.5), "normalised by the width$"),  # the file's origin is ½
     ((F, 5.2, -6.1), r"\(5.2, -6.1\), far from the middle; it may be measured from the middle$"),
-    (scaled(2), r"the principal point at \(1930, 1066\), far .* would fit 38\d\d × 21\d\d px"),
-    (scaled(1 / 2), r"far from the middle; .* would fit 95\d × 53\d px, or the picture is a crop"),
-    (scaled(1 / 4), r"far from the middle; .* would fit 47\d × 2\d\d px, or the picture is a crop"),
+    (scaled(2), r"the principal point at \(1930, 1066\), far .* would fit 21\d\d × 38\d\d px"),
+    (scaled(1 / 2), r"far from the middle; .* would fit 53\d × 95\d px .*, or the picture is a cr"),
+    (scaled(1 / 4), r"far from the middle; .* would fit 2\d\d × 47\d px .*, or the picture is a c"),
     ((F, CX, CY, F, (W, H)), "; width and height seem to be swapped"),
     ((F, 640, 480, F, (1280, 960)), "; width and height seem to be swapped"),
     ((F, 640, 512, F, (1280, 1024)), "; width and height seem to be swapped"),
@@ -81,7 +82,7 @@ WRONG = [
 def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     lens = make(*arguments)
     (doubt,) = doubts(lens.with_theta_max(lens.side_angles().amax(1)))
-    assert re.search(pattern, doubt) and re.match(r"a picture of \d+ × \d+ px with ", doubt), doubt
+    assert re.search(pattern, doubt) and re.match(r"a picture of \d+ × \d+ px \(H", doubt), doubt
     assert "\n" not in doubt and len(doubt) < 250
 
 
@@ -94,9 +95,18 @@ def test_lengths_in_another_unit_are_doubted(make, arguments, pattern):
     (Perspective(F, 1.57, image_size=(H, W)), "a θ_max of 89.95°"),
     (KannalaBrandt(F, [2.0, -0.1, 3.0], 1.0, image_size=(H, W)), r"change \d\d-fold, as after"),
     (BrownConrady(F, [9.0], 0.9, image_size=(H, W)), r"change \d\d-fold, as after"),
+    (Equidistant(2.1), "^0.037 px per degree, as if the lengths were in mm; they are in px$"),
 ])  # fmt: skip
 def test_every_part_of_a_lens_is_held_against_its_picture(lens, pattern):
     assert re.search(pattern, doubts(lens)[0]), doubts(lens)[0]
+
+
+def test_a_view_holds_a_lens_without_a_size_against_the_picture():
+    view = make_view("mercator", (8, 8))
+    with pytest.warns(ImplausibleLens, match="describes a picture of .* would fit in mm"):
+        view.at(Equidistant(2.1, 1.5), (H, W))
+    with warnings.catch_warnings(action="error"):
+        view.at(Equidistant(F, 1.5), (H, W))
 
 
 def genuine():
@@ -164,14 +174,14 @@ def test_any_numbers_get_a_doubt_of_one_line():
         affine, focal = [[stretch, 0.0], [0.0, 1.0]], torch.tensor(focal, dtype=f64)
         lens = Equidistant(focal, 1.0, [x, y], affine=affine, image_size=(480, 640))
         (doubt,) = doubts(lens)
-        assert doubt.startswith("a picture of 640 × 480 px with ") and len(doubt) < 300, doubt
+        assert doubt.startswith("a picture of 480 × 640 px (H ") and len(doubt) < 300, doubt
 
 
 def test_a_batch_is_doubted_lens_by_lens():
     lens = Equidistant([300.0, 0.9, 310.0], 1.6, image_size=(640, 640))
     assert [bool(doubt) for doubt in doubts(lens)] == [False, True, False]
     assert doubts(lens) == [doubts(lens[i])[0] for i in range(3)]
-    assert doubts(Equidistant([3.0, 4.0])) == ["", ""]  # without a picture
+    assert doubts(Equidistant([30.0, 40.0])) == ["", ""]  # without a picture
     rows = torch.tensor([[200.0, 0.0], [50.0, 300.0]], requires_grad=True)
     assert len(doubts(Equidistant(torch.tensor(9.0), center=rows, image_size=(9, 9)))) == 2
 
@@ -194,11 +204,14 @@ def test_loading_warns_once_in_one_line(tmp_path, given):
     path.write_text(in_mm(fisheye_model=1))
     for read in (load, load_all):
         (said,) = warned(lambda read=read: read(path, **given))
-        assert said.startswith(f"OpenCV calibration {path}: it describes a picture of 1280 × 960")
+        assert said.startswith(f"OpenCV calibration {path}: it describes a picture of 960 × 1280")
         assert "the focal length would fit in mm" in said and "\n" not in said
     # The size may come from the caller, whose θ_max is not in doubt.
     path.write_text(re.sub('"(width|height)": [0-9]+, ', "", in_mm(fisheye_model=1)))
-    assert not warned(lambda: load(path, **given))
+    (said,) = warned(lambda: load(path, **given))
+    assert said.endswith(
+        "describes 0.023 px per degree, as if the lengths were in mm; they are in px"
+    )
     assert len(warned(lambda: load(path, image_size=(960, 1280), **given))) == 1
     path.write_text(opencv(D=FISHEYE, fisheye_model=1, rms_error=0.4))
     assert not warned(lambda: load(path, theta_max=0.01))

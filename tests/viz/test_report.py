@@ -39,15 +39,17 @@ def test_pixels_per_degree_are_those_between_neighbours():
 
 def test_field_of_view_and_sides():
     text = describe(FRONT)
-    sides = FRONT.to(torch.float64).side_angles()[0].rad2deg().tolist()
-    assert f"{sides[0] + sides[2]:.2f}° across, {sides[1] + sides[3]:.2f}° down" in text
-    for side, angle in zip(("left", "top", "right", "bottom"), sides, strict=True):
-        assert f"{side} {angle:.2f}°" in text
-    assert "between the corners" in text
+    sides, end = FRONT.to(torch.float64).side_angles()[0], FRONT.theta_max.item()
+    seen = sides.clamp(max=end).rad2deg().tolist()
+    assert f"{seen[0] + seen[2]:.2f}° across, {seen[1] + seen[3]:.2f}° down" in text
+    for side, angle in zip(("left", "top", "right", "bottom"), sides.tolist(), strict=True):
+        beyond = " (beyond θ_max)" * (angle > end)
+        assert f"{side} {math.degrees(angle):.2f}°{beyond}" in text
+    assert "° between the corners (beyond θ_max)" in text
     assert "the lens ends before the corners" in describe(MEI)
     with pytest.raises(ValueError, match="give image_size"):
         describe(Spherical(0.5, 100.0))
-    assert "640 × 480 px" in describe(Spherical(0.5, 100.0), (480, 640))
+    assert "480 × 640 px (H × W)" in describe(Spherical(0.5, 100.0), (480, 640))
 
 
 def test_a_principal_point_outside_the_sensor():

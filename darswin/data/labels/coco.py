@@ -37,7 +37,9 @@ from darswin.data.labels.labels import (
 from darswin.data.scenes.files import calibration_in
 from darswin.data.splits import some
 from darswin.utils.files import replace_file
+from darswin.utils.image import read_header
 from darswin.utils.text import read_json
+from darswin.utils.words import counted, in_px
 
 _OWN = {"segmentation", "bbox", "area", "iscrowd", "category_id", "keypoints", "num_keypoints",
         "visible"}  # fmt: skip
@@ -90,7 +92,7 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
     folder = Path(pictures) if pictures is not None else _folder(path, files)
     there = [(folder / file).is_file() for file in files]
     if missing := [file for file, is_there in zip(files, there, strict=True) if not is_there]:
-        text = f"{len(missing)} of {len(files)} pictures of {path} are not in {folder}"
+        text = f"{path}: {len(missing)} of {counted(len(files), 'picture')} missing in {folder}"
         if len(missing) == len(files):
             raise FileNotFoundError(f"{text}: {some(missing)}")
         wrong += [f"{path}: there is no picture {file} in {folder}" for file in missing]
@@ -102,7 +104,7 @@ def read_coco(path: str | Path, pictures: str | Path | None = None) -> LabelledP
     return LabelledPictures(
         folder, list(compress(files, there)),
         [(entry, of_picture[entry["id"]]) for entry in entries],
-        partial(_labels, path=str(path), points=points), categories, entries,
+        partial(_labels, path=str(path), folder=folder, points=points), categories, entries,
         Calibrations(calibration, folder) if calibration else None, wrong,
     )  # fmt: skip
 
@@ -263,16 +265,19 @@ def _folder(path: Path, files: Sequence[str]) -> Path:
 
 
 def _labels(
-    raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, points: Mapping
+    raw: tuple[Mapping, Sequence[Mapping]], size: Size, path: str, folder: Path, points: Mapping
 ) -> tuple[Labels, list[str]]:
     entry, annotations = raw
     said = tuple(map(_side, (entry.get("height"), entry.get("width"))))
     if said not in (size, (None, None)):
-        turned = " when its EXIF orientation turns it upright, as labels need it"
-        raise ValueError(
-            f"{path} says that {entry['file_name']} has {said[1]} × {said[0]} px, but it has "
-            f"{size[1]} × {size[0]}{turned if said == size[::-1] else ''}"
-        )
+        name, why = entry["file_name"], ""
+        if said == size[::-1]:
+            is_upright = read_header(folder / name).size == size
+            why = ": its width and height are swapped" if is_upright else (
+                " when its EXIF orientation turns it upright, as labels need it"
+            )  # fmt: skip
+        sides = "{} × {}".format(*said)  # which may be no numbers
+        raise ValueError(f"{path} says that {name} has {sides}, but it has {in_px(size)}{why}")
     instances, wrong = [], []
     for annotation in annotations:
         try:

@@ -36,6 +36,7 @@ from darswin.data.scenes.files import calibration_in, pictures_in
 from darswin.data.splits import read_list, some
 from darswin.utils.files import replace_file
 from darswin.utils.text import read_text
+from darswin.utils.words import counted
 
 _SPLITS = ("train", "val", "test")
 _NAMES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt")
@@ -277,7 +278,7 @@ def _without_picture(root: Path, texts: Sequence[Path]) -> list[str]:
     roots = {place for place in roots if place.name == "labels"}
     alone = [text for text in map(Path, files_below(root)) if text not in used]
     return [
-        f"{text} has {count} labels, but no picture has its name: did a tool change it?"
+        f"{text} has {counted(count, 'label')}, but no picture has its name: did a tool change it?"
         for text in alone
         if text.suffix == ".txt" and (text.parent in folders or not roots.isdisjoint(text.parents))
         if (count := sum(len(row) > 4 for *_, row in _lines(text)))

@@ -24,6 +24,7 @@ from darswin.data.splits import (
 )
 from darswin.utils.parameters import naming
 from darswin.utils.tasks import IGNORE
+from darswin.utils.words import counted
 
 Pairs = dict[str, tuple[str, str]]  # stem: (picture, target), relative to a folder
 ScenesSplit = Literal["train", "val", "test", "all"]
@@ -136,10 +137,8 @@ class Options:
         part, held_out = taken_from(self.split, given)
         chosen = given[part]
         if unknown := sorted(set(chosen) - set(found)):
-            raise FileNotFoundError(
-                f"{self.splits} lists {len(unknown)} pictures for {part!r} that are not in {root}: "
-                f"{some(unknown)}"
-            )
+            text = f"{self.splits} lists {counted(len(unknown), 'picture')} for {part!r} missing in"
+            raise FileNotFoundError(f"{text} {root}: {some(unknown)}")
         if not chosen:
             raise FileNotFoundError(f"{self.splits} lists no pictures for {part!r}")
         return part_of_split(chosen, self.split, held_out, self.holdout, root, group=group)
@@ -156,7 +155,8 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
         given[split] = list(dict.fromkeys(map(stem_of, names)))
     split_of = split_of_each(given, path)
     if left := [stem for stem in found if stem not in split_of]:
-        warn_left_out(f"{path} lists {len(left)} pictures for no split, {some(left)}: left out")
+        pictures = counted(len(left), "picture")
+        warn_left_out(f"{path} lists {pictures} for no split, {some(left)}: left out")
     return given
 
 
@@ -241,18 +241,18 @@ def pair(
     if not strict:
         found = [stem for stem in pictures if stem in targets]
         if without := len(pictures) - len(found):
-            warn_left_out(
-                f"{without} of {len(pictures)} pictures in {root} have no {what}: left out"
-            )
+            total = counted(len(pictures), "picture")
+            warn_left_out(f"no {what} for {without} of {total} in {root}: left out")
         if not found:
             raise FileNotFoundError(f"none of {len(pictures)} pictures in {root} has {what}")
     if alone := [targets[stem] for stem in targets if stem not in pictures]:
-        warn_left_out(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
+        files = counted(len(alone), "file")
+        warn_left_out(f"no picture for {files} of {what}, {some(alone)}: left out")
     chosen = choose(found)
     if missing := [pictures[stem] for stem in chosen if stem not in targets]:
         text = (
-            f"no {what} for {len(missing)} of {len(chosen)} pictures, {some(missing)}: add them, "
-            "move the pictures away, or list the other pictures in `splits`"
+            f"no {what} for {len(missing)} of {counted(len(chosen), 'picture')}, {some(missing)}: "
+            "add them, move the pictures away, or list the other pictures in `splits`"
         )
         raise naming(FileNotFoundError(text), "splits")
     return {

@@ -23,6 +23,7 @@ from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
 from darswin.utils.image import Header, read_header, read_oriented
 from darswin.utils.text import is_json_file, read_json
+from darswin.utils.words import in_px
 
 
 class Classes(NamedTuple):
@@ -120,10 +121,9 @@ class Scenes(Limited):
                 "distances may fit the stored or the upright picture: store it upright"
             )
         if target != size:
-            shapes = [f"{height}×{width}" for height, width in (target, size)]
             raise ValueError(
-                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
-                f"{self.file(index)} has {shapes[1]}"
+                f"{self.target_file(index)} has {in_px(target)}, but its picture "
+                f"{self.file(index)} has {in_px(size)}"
             )
 
     def limited(self, count: int) -> Self:

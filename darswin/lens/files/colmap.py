@@ -138,5 +138,5 @@ def from_binary(data: bytes, most: int) -> str:
     except struct.error as error:
         raise ValueError(f"it ends within camera {len(lines) + 1} of {count}") from error
     if place != len(data):
-        raise ValueError(f"it has {len(data) - place} extra bytes after its {count} cameras")
+        raise ValueError(f"it has {len(data) - place} extra bytes after the last camera")
     return "\n".join(lines)

@@ -24,6 +24,7 @@ from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.parameters import check, naming
+from darswin.utils.words import counted
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
 MAX_RADIUS = 1e6
@@ -231,7 +232,7 @@ class Calibration:
         names = [name for name, doubt in doubts.items() if doubt]
         if names:
             which = f"camera {short(names[0])}: " if len(self.names) > 1 else ""
-            more = f" (and {len(names) - 1} more cameras)" if len(names) > 1 else ""
+            more = f" (and {counted(len(names) - 1, 'more camera')})" if len(names) > 1 else ""
             text = f"{self.what}: {which}it describes {doubts[names[0]]}{more}"
             warnings.warn(text, ImplausibleLens, stacklevel=2)
 

@@ -23,6 +23,7 @@ from darswin.lens.files.format import Description, describe
 from darswin.lens.image import Size
 from darswin.lens.plausible import NEAR, off_middle, swap_fits
 from darswin.utils.parameters import naming
+from darswin.utils.words import in_px
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -296,7 +297,7 @@ def _in_message(
         if not (0 < width <= columns - left and 0 < height <= rows - top):
             raise ValueError(
                 "roi must be a part of the image of 1 pixel or more, or all 0, got "
-                f"{width}×{height} px at ({left}, {top})"
+                f"{in_px((height, width))} at x = {left}, y = {top}"
             )
         if size is not None:
             sides = size[0] / down, size[1] / across

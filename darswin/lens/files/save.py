@@ -18,11 +18,14 @@ from darswin.lens.files.named import KALIBR
 from darswin.lens.files.own import Own
 from darswin.lens.fitting import Fit, fit, largest_distance
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import naming
 
 # The formats that `save` writes.
 WRITTEN: dict[str, Format] = {
     "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": KALIBR
 }  # fmt: skip
+_BY_SUFFIX = {".json": "darswin", "": "darswin", ".txt": "colmap",
+              **dict.fromkeys((".yaml", ".yml", ".xml"), "opencv")}  # fmt: skip
 # The models that other programs know up to 90° from the axis alone.
 IN_FRONT = {
     "darswin": "",
@@ -47,7 +50,7 @@ def save(
     Args:
         format: "darswin", "opencv", "colmap" or "kalibr". None chooses by the path: OpenCV for
             .xml, .yaml and .yml, but Kalibr if the name contains "camchain" or "kalibr"; COLMAP
-            for .txt; else our own JSON.
+            for .txt; our own JSON for .json and without an ending.
         supported: rad: the angle up to which corners support the lens, as `CalibratedLens` has it.
             Our own JSON keeps it beside the lens; other formats have no place for it.
 
@@ -57,7 +60,7 @@ def save(
 
     Raises:
         ValueError: several lenses, a lens of a model that is not in `MODELS`, a lens that the
-            format cannot hold exactly, or a wrong angle.
+            format cannot hold exactly, another ending without a format, or a wrong angle.
     """
     format = format_of(path, format)
     writer = WRITTEN[format]
@@ -77,8 +80,11 @@ def format_of(path: str | os.PathLike, format: str | None) -> str:
     path = Path(path)
     suffix = path.suffix.lower()
     if format is None:
-        by_suffix = {".xml": "opencv", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
-        format = by_suffix.get(suffix, "darswin")
+        if suffix not in _BY_SUFFIX:
+            known = ", ".join(filter(None, _BY_SUFFIX))
+            text = f"the ending of {path} names no format: take one of {known}, or give `format`"
+            raise naming(ValueError(text), "format")
+        format = _BY_SUFFIX[suffix]
         if suffix in (".yaml", ".yml") and re.search("camchain|kalibr", path.stem.lower()):
             format = "kalibr"
     if format not in WRITTEN:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers import refused
+from PIL import ExifTags, Image
 from scenes import write_woodscape
 
 from darswin.boxes import Instances, encode_rle
@@ -199,14 +200,21 @@ def pictures_with(**changes):
         ({"annotations": {}}, 'must have the lists "images"'),
         ({"categories": [{"name": "dog"}]}, "lacks 'id'"),
         ({"images": [*IMAGES, IMAGES[0]]}, "lists a picture twice"),
-        (pictures_with(width=81), "81 × 60 px, but it has 80 × 60"),
-        (pictures_with(width=60, height=80), "80 × 60 when its EXIF orientation turns it upright"),
-        ({"images": [{"file_name": "d.png", "id": 9}]}, r"1 of 1 pictures .*d\.png"),
+        (pictures_with(width=81), "60 × 81, but it has 60 × 80 px"),
+        (pictures_with(width=60, height=80), "80 × 60, .* 60 × 80 px .* are swapped"),
+        ({"images": [{"file_name": "d.png", "id": 9}]}, r"1 of 1 picture .*d\.png"),
     ],
 )
 def test_wrong_coco_files(tmp_path, changes, said):
     with pytest.raises((ValueError, FileNotFoundError), match=said):
         read_coco(write(tmp_path, **changes)).labels(0)
+
+
+def test_sides_before_exif_turns_a_picture_are_told(tmp_path):
+    file, exif = write(tmp_path), Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("L", (80, 60)).save(tmp_path / "images" / "a.png", exif=exif)
+    refused("80 × 60 px .* when its EXIF orientation turns it", read_coco(file).labels, 0)
 
 
 def test_annotations_and_pictures_that_cannot_be_used_are_named(tmp_path):

@@ -119,7 +119,7 @@ def test_the_split_of_heal_swin(tmp_path):
     # Lists as OmniDet's: a test set whose labels are withheld.
     (tmp_path / "lists").mkdir()
     (tmp_path / "lists" / "test.txt").write_text("08234_FV.png\n")
-    said = r"1 pictures for 'test' .* not in .*08234_FV"
+    said = r"1 picture for 'test' missing .*08234_FV"
     missing(tmp_path, said, split="test", splits=tmp_path / "lists")
 
 
@@ -153,7 +153,7 @@ def test_what_woodscape_does_not_have(tmp_path):
 @left_out_is_allowed
 def test_kitti360(tmp_path):
     write_kitti360(tmp_path)
-    with pytest.warns(LeftOut, match="6 of 18 pictures in .* have no distance: left out"):
+    with pytest.warns(LeftOut, match="no distance for 6 of 18 pictures in .*: left out"):
         scenes = open_scenes(tmp_path, "all", "distance")
     assert len(scenes) == 12 and scenes.cameras == ["image_02", "image_03"]
     scene = scenes[0]
@@ -491,7 +491,7 @@ def test_lists_of_plain_scenes(tmp_path):
         ({"train": ["a/00"], "val": ["a/00"]}, "a/00 for 'train' and for 'val'", ValueError),
         ({"train": [3]}, "must list names for 'train', got 3", ValueError),
         ({"train": []}, "lists no pictures for 'train'", FileNotFoundError),
-        ({"train": ["a/77"]}, "1 pictures for 'train' that are not in .*a/77", FileNotFoundError),
+        ({"train": ["a/77"]}, "1 picture for 'train' missing in .*a/77", FileNotFoundError),
     ):
         file.write_text(json.dumps(lists))
         refused(tmp_path, message, splits=file, error=error)
@@ -557,7 +557,7 @@ def test_missing_labels_and_pictures_are_named(tmp_path):
     with pytest.warns(LeftOut) as caught:
         assert len(open_scenes(tmp_path, "train", "labels", splits=file, holdout=0)) == 2
     text = "\n".join(str(warning.message) for warning in caught)
-    assert "1 files of labels have no picture" in text
+    assert "no picture for 1 file of labels" in text
     assert "pictures that darswin does not read, 1 .gif" in text
     (tmp_path / "distance" / "001.npy").write_bytes(b"")
     refused(tmp_path, r"001\.npy and .*001\.png have the same stem", split="all", target="distance")

@@ -108,7 +108,7 @@ def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
     lens = json.loads((tmp_path / "lens.json").read_text())
     (tmp_path / "lens.json").write_text(json.dumps(lens | {"image_size": [50, 50]}))
     scenes = open_scenes(tmp_path, "all", "labels")
-    refused(r"000\.png: the calibration is for 50×50", scenes.__getitem__, 0)
+    refused(r"000\.png: the calibration is for 50 × 50", scenes.__getitem__, 0)
     write(tmp_path / "labels" / "002.png", np.full(SIZE, IGNORE, np.uint8))
     write_plain(tmp_path, 2)
     scenes = open_scenes(tmp_path, "all", "labels")
