@@ -177,7 +177,7 @@ TEXTS = (
     (message((1, 1.5)), "binning_y must be a whole number of pixels, 0 to"),
     (message((1, 961)), "the binning of 1×961 pixels leaves none"),
     (message(roi=(5, 0, 0, 0)), "roi must be a part of the image of 1 pixel or more"),
-    (message(roi=(0, 0, 1281, 9)), "1281×9 px at (0, 0)"),
+    (message(roi=(0, 0, 1281, 9)), "9 × 1281 px (H × W) at x = 0, y = 0"),
     (message(roi=(-1, 0, 10, 9)), "roi.x_offset must be a whole number of pixels"),
     (message(roi=(0, 0, "a", 9)), "roi.width must be a whole number"),
     # Coefficients that are missing or have an unknown name are never ignored.
