@@ -143,15 +143,18 @@ def draw_found(rows: list[Row], path: Path) -> None:
             best = np.argsort(-found.scores)[: (found.scores >= SURE).sum()]
             named: set[int] = set()  # the best box of each class has its name
             for box, label in zip(found.boxes[best], found.labels[best], strict=True):
-                add_box(axes, box * (512 / SIZE), "" if label in named else COCO[label])
+                text = "" if label in named else COCO[label]
+                # Names of neighbours are in turns above and below their boxes.
+                add_box(axes, box * (512 / SIZE), text, below=len(named) % 2 == 1)
                 named.add(label)
     save_figure(figure, path, colors=256)
 
 
-def add_box(axes: Axes, box: np.ndarray, text: str) -> None:
+def add_box(axes: Axes, box: np.ndarray, text: str, *, below: bool) -> None:
     x, y, right, lower = box
     axes.add_patch(Rectangle((x, y), right - x, lower - y, fill=False, ec="lime", lw=1.2))
-    axes.text(x, y - 5, text, color="lime", fontsize=TEXT, clip_on=True)
+    place, side = (lower + 5, "top") if below else (y - 5, "bottom")
+    axes.text(x, place, text, color="lime", fontsize=TEXT, va=side, clip_on=True)
 
 
 # -- tables -----------------------------------------------------------------------------------

@@ -33,10 +33,12 @@ def draw_calibration(
         lens: `found.lens`, perhaps with another θ_max.
         read: returns the picture of a name, (H, W, 3) uint8. None leaves the pictures out.
     """
-    figure = page_figure(6.4 if read is None else 11.4)
+    height, width = lens.image_size[0].tolist()
+    upper = 2 * (1.15 + 2.05 * min(height / width, 1.2))  # inches: titles, scales and two panels
+    figure = page_figure(upper if read is None else upper + 5.0)
     top: FigureBase = figure
     if read is not None:
-        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(6.4, 5.0)).flat
+        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(upper, 5.0)).flat
         _draw_worst(below, found, read)
     panels = top.subplot_mosaic([["corners", "residuals"], ["map", "curve"]])
     seen = ~torch.isnan(found.theta).numpy()
@@ -47,7 +49,6 @@ def draw_calibration(
     _draw_residuals(panels["residuals"], points, misses, counts, lens)
     _draw_map(panels["map"], found, lens)
     _draw_curve(panels["curve"], found, lens)
-    height, width = lens.image_size[0].tolist()
     around = torch.linspace(0, 2 * math.pi, 181, dtype=torch.float64)
     rim = lens.project_rays(lens.theta_max, around).numpy()
     for name in ("corners", "residuals", "map"):
@@ -151,6 +152,6 @@ def _draw_curve(axes: Axes, found: CalibratedLens, lens: Lens) -> None:
     beside.set_ylabel("2σ of r (px)", color="C0")
     beside.set_ylim(0, 2 * band.max().item())
     last = math.degrees(found.supported)
-    axes.axvline(last, color="0.4", ls="--", lw=1)
-    axes.text(last, 0.03, "last corners ", transform=axes.get_xaxis_transform(), rotation=90,
-              ha="right", va="bottom", color="0.3")  # fmt: skip
+    axes.axvline(last, color="0.4", ls="--", lw=1, label="last corners")
+    axes.legend(loc="upper left")
+    axes.set_box_aspect((lens.image_size[0, 0] / lens.image_size[0, 1]).item())  # as of the map
