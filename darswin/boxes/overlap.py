@@ -7,6 +7,7 @@ import numpy as np
 from darswin.boxes.arrays import Array, floats, like, shape_of, table_of, to_numpy
 from darswin.boxes.turned import as_turned, common_area, upright
 
+_CUT = 0.35  # of a box at the border of a view, from which on a whole one shows the same thing
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
 
@@ -44,6 +45,21 @@ def merge(
     Raises:
         ValueError: other shapes, or a limit that is not in [0, 1].
     """
+    kept = np.unique(whole_of(boxes, scores, labels, iou=iou, inside=inside))
+    kept = kept[kept >= 0]
+    return like(boxes, kept[np.argsort(-floats(scores)[kept], kind="stable")])
+
+
+def whole_of(
+    boxes: Array, scores: Array, labels: Array, cut: Array = False, *, iou: float, inside: float
+) -> np.ndarray:
+    """For each of the detections of `merge`, the row that is kept in its place, its own or another;
+    -1 for NaN.
+
+    Args:
+        cut: (K,), whether the border of a view cuts a box. It is never kept in place of a whole
+            one, and not kept if a whole one covers a third of it.
+    """
     for name, limit in (("iou", iou), ("inside", inside)):
         if not 0 <= limit <= 1:
             raise ValueError(f"{name} must be in [0, 1], got {limit}")
@@ -53,10 +69,11 @@ def merge(
             raise ValueError(
                 f"{name} must have shape ({len(table)},), as the boxes, got {shape_of(values)}"
             )
-    order = np.argsort(-score, kind="stable")
+    is_cut = np.broadcast_to(cut, score.shape)
+    order = np.lexsort((-score, is_cut))
     order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
-    table, label = table[order], label[order]
-    area, kept = _area(table), np.ones(len(order), bool)
+    table, label, is_cut = table[order], label[order], is_cut[order]
+    area, place = _area(table), np.arange(len(order))
     x0, x1 = np.ascontiguousarray(upright(table)[:, ::2].T)
     for start in range(0, len(order), _ROWS):
         rows, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
@@ -68,14 +85,17 @@ def merge(
         better, worse = better[ahead] + start, worse[ahead] + start
         common = _common(table[better], table[worse])
         drops = _ratio(common, area[better] + area[worse] - common) > iou
-        drops |= _ratio(common, area[worse]) > inside
+        limits = np.where(is_cut[worse] & ~is_cut[better], min(inside, _CUT), inside)
+        drops |= _ratio(common, area[worse]) > limits
         better, worse = better[drops], worse[drops]  # sorted by the better one
         starts = np.flatnonzero(np.diff(better, prepend=-1))
         groups = np.split(worse, starts[1:])
         for best, dropped in zip(better[starts].tolist(), groups, strict=False):
-            if kept[best]:
-                kept[dropped] = False
-    return like(boxes, order[kept])
+            if place[best] == best:
+                place[dropped] = np.minimum(place[dropped], best)
+    rows = np.full(len(score), -1)
+    rows[order] = order[place]
+    return rows
 
 
 def _area(boxes: np.ndarray) -> np.ndarray:

@@ -63,7 +63,7 @@ def grids(size: Size) -> dict[int, tuple[tuple[int, ...], int]]:
     """The strides of the grids that have so many cells, and 1, or a third of them, and 3."""
     strides_of: dict[int, tuple[tuple[int, ...], int]] = {}
     for strides in ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32)):
-        count = len(cells(size, strides))
+        count = sum(math.ceil(size[0] / of) * math.ceil(size[1] / of) for of in strides)
         strides_of = {count: (strides, 1), 3 * count: (strides, 3)} | strides_of
     return strides_of
 
