@@ -8,7 +8,7 @@ import numpy as np
 
 from darswin.boxes.arrays import PointMap, floats, table_of
 from darswin.boxes.carried import carry, carry_points, cut_polygon
-from darswin.boxes.overlap import clip, whole_of
+from darswin.boxes.overlap import clip, mend, merge
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask, shown_parts
 from darswin.boxes.rle import decode_rle, encode_rle
 from darswin.boxes.turned import as_turned, upright
@@ -120,20 +120,20 @@ class Instances:
     def merged(self, *, iou: float = 0.5, inside: float = 0.7) -> Self:
         """The best of those that show the same thing, the best first; see `darswin.boxes.merge`.
 
-        Boxes that the border of a view cuts ("cut" of `through`) are left out if a whole one covers
-        a third of them. It gets their score if that is higher.
+        A box that the border of its view cuts ("cut" of `through`) is left out if a larger whole
+        one covers a third of it, which gets the higher score of both. Other cut boxes of one thing
+        are joined. Masks and keypoints are those of the best part.
 
         Raises:
             ValueError: there are no scores or no labels.
         """
         if self.scores is None or self.labels is None:
             raise ValueError("instances need scores and labels to be merged")
-        columns, cut = (self.boxes, self.scores, self.labels), self.more.get("cut", False)
-        whole = whole_of(*columns, cut, iou=iou, inside=inside)
-        scores, known = np.full(len(self), -np.inf), whole >= 0
-        np.maximum.at(scores, whole[known], floats(self.scores)[known])
-        kept = np.unique(whole[known])
-        return replace(self, scores=scores)[kept[np.argsort(-scores[kept], kind="stable")]]
+        boxes, scores = self.boxes, floats(self.scores)
+        if "cut" in self.more:
+            boxes, scores = mend(boxes, scores, np.asarray(self.labels), self.more["cut"])
+        kept = merge(boxes, scores, self.labels, iou=iou, inside=inside)
+        return replace(self, boxes=boxes, scores=scores)[kept]
 
     @property
     def upright(self) -> np.ndarray:

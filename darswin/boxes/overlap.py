@@ -7,7 +7,8 @@ import numpy as np
 from darswin.boxes.arrays import Array, floats, like, shape_of, table_of, to_numpy
 from darswin.boxes.turned import as_turned, common_area, upright
 
-_CUT = 0.35  # of a box at the border of a view, from which on a whole one shows the same thing
+_PART = 0.35  # of a box that a view cuts, from which on another one shows the same thing
+_LEAST = 0.3  # of its score, which the other one must have
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
 
@@ -45,21 +46,6 @@ def merge(
     Raises:
         ValueError: other shapes, or a limit that is not in [0, 1].
     """
-    kept = np.unique(whole_of(boxes, scores, labels, iou=iou, inside=inside))
-    kept = kept[kept >= 0]
-    return like(boxes, kept[np.argsort(-floats(scores)[kept], kind="stable")])
-
-
-def whole_of(
-    boxes: Array, scores: Array, labels: Array, cut: Array = False, *, iou: float, inside: float
-) -> np.ndarray:
-    """For each of the detections of `merge`, the row that is kept in its place, its own or another;
-    -1 for NaN.
-
-    Args:
-        cut: (K,), whether the border of a view cuts a box. It is never kept in place of a whole
-            one, and not kept if a whole one covers a third of it.
-    """
     for name, limit in (("iou", iou), ("inside", inside)):
         if not 0 <= limit <= 1:
             raise ValueError(f"{name} must be in [0, 1], got {limit}")
@@ -69,11 +55,10 @@ def whole_of(
             raise ValueError(
                 f"{name} must have shape ({len(table)},), as the boxes, got {shape_of(values)}"
             )
-    is_cut = np.broadcast_to(cut, score.shape)
-    order = np.lexsort((-score, is_cut))
+    order = np.argsort(-score, kind="stable")
     order = order[np.isfinite(table).all(1)[order] & ~np.isnan(score)[order]]
-    table, label, is_cut = table[order], label[order], is_cut[order]
-    area, place = _area(table), np.arange(len(order))
+    table, label = table[order], label[order]
+    area, kept = _area(table), np.ones(len(order), bool)
     x0, x1 = np.ascontiguousarray(upright(table)[:, ::2].T)
     for start in range(0, len(order), _ROWS):
         rows, rest = np.s_[start : start + _ROWS, None], np.s_[None, start:]
@@ -85,17 +70,47 @@ def whole_of(
         better, worse = better[ahead] + start, worse[ahead] + start
         common = _common(table[better], table[worse])
         drops = _ratio(common, area[better] + area[worse] - common) > iou
-        limits = np.where(is_cut[worse] & ~is_cut[better], min(inside, _CUT), inside)
-        drops |= _ratio(common, area[worse]) > limits
+        drops |= _ratio(common, area[worse]) > inside
         better, worse = better[drops], worse[drops]  # sorted by the better one
         starts = np.flatnonzero(np.diff(better, prepend=-1))
         groups = np.split(worse, starts[1:])
         for best, dropped in zip(better[starts].tolist(), groups, strict=False):
-            if place[best] == best:
-                place[dropped] = np.minimum(place[dropped], best)
-    rows = np.full(len(score), -1)
-    rows[order] = order[place]
-    return rows
+            if kept[best]:
+                kept[dropped] = False
+    return like(boxes, order[kept])
+
+
+def mend(
+    boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, cut: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The boxes (K, 4 or 5) and scores (K,) of detections, of which the borders of several views
+    cut some, (K,) bool; NaN scores for parts of things that another detection stands for.
+
+    A whole box that is larger than a cut one and covers a third of it shows the same thing, and
+    gets the higher score of both. Other upright boxes that are cut and share a third of the smaller
+    one are joined. In both cases, the box that stays has at least 0.3 of the score of the other.
+    """
+    boxes, area = boxes.copy(), _area(boxes)
+    scores = np.where(np.isfinite(boxes).all(1), scores, np.nan)
+    parts = np.flatnonzero(cut)[np.argsort(-scores[cut], kind="stable")].tolist()
+    for k in parts:
+        common = _common(boxes[k], boxes)
+        same = (labels == labels[k]) & (scores >= _LEAST * scores[k]) & (common > _PART * area[k])
+        whole = np.flatnonzero(same & ~cut & (area >= area[k]))
+        if len(whole):
+            best = whole[scores[whole].argmax()]
+            scores[best], scores[k] = max(scores[best], scores[k]), np.nan
+    for k in parts if boxes.shape[1] == 4 else ():
+        while True:
+            common, least = _common(boxes[k], boxes), np.minimum(_area(boxes[k]), area)
+            same = cut & (labels == labels[k]) & (common > _PART * least)
+            same &= (scores <= scores[k]) & (scores >= _LEAST * scores[k])
+            same[k] = False
+            if not same.any():
+                break
+            low, high = np.vstack((boxes[k], boxes[same])).reshape(-1, 2, 2).swapaxes(0, 1)
+            boxes[k], scores[same] = (*low.min(0), *high.max(0)), np.nan
+    return boxes, scores
 
 
 def _area(boxes: np.ndarray) -> np.ndarray:

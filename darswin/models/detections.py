@@ -10,6 +10,7 @@ from torch.utils import _pytree as pytree
 
 from darswin.boxes import Instances
 from darswin.boxes.arrays import to_numpy
+from darswin.boxes.turned import as_turned
 from darswin.models.prepared import Prepared
 from darswin.views import PixelView, Remap, View
 from darswin.views.remap import tensor_like
@@ -141,7 +142,12 @@ def in_picture(remap: Remap, tiles: Sequence[Instances]) -> Instances:
         parts.append(part[part.more["visible"] > 0])
     detections = Instances.joined(parts)
     if len(parts) > 1:
-        return detections.merged()
+        merged = detections.merged()
+        if "rays" not in merged.more:
+            return merged
+        there = np.nan_to_num(remap.rays_of_image(as_turned(merged.boxes)[:, :2] - 0.5))
+        is_cut = merged.more["cut"][:, None]  # and perhaps joined: its middle is another one
+        return merged.with_columns(rays=np.where(is_cut, there, merged.more["rays"]))
     # A network knows best which of its own boxes are one instance.
     return detections[np.argsort(-detections.scores, kind="stable")]
 
