@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from darswin.boxes import Instances
-from darswin.boxes.arrays import to_numpy
+from darswin.boxes.arrays import like, to_numpy
 from darswin.boxes.turned import as_turned
 from darswin.models.prepared import Prepared
 from darswin.views import PixelView, Remap, View
@@ -159,9 +159,9 @@ def detections_to_images(
 
     Args:
         detections: for each picture, boxes (K, 4 or 5), scores (K,) and labels (K,); and optionally
-            masks (K, 1, H', W') and keypoints (K, P, 3), and other tensors (K, ...), which stay as
-            they are. Values of another length are left out. The coordinates are those of
-            `darswin.boxes`.
+            masks (K, 1, H', W'), of the view, of a whole fraction of it, or of each box alone,
+            keypoints (K, P, 3), and other tensors (K, ...), which stay as they are. Values of
+            another length are left out. The coordinates are those of `darswin.boxes`.
 
     Returns:
         For each image, the same dicts, as `in_picture` says, the best first; with "visible" (K,),
@@ -188,6 +188,7 @@ def detections_to_images(
         rows = torch.from_numpy(starts[tile_of] + row_of)
         result = {name: torch.cat([tile[name] for tile in tiles]) for name in names}
         result = {name: column[rows.to(column.device)] for name, column in result.items()}
+        in_view = result["boxes"]
         if (points := result.get("keypoints")) is not None:  # scores keep their gradients
             places = tensor_like(points, moved.keypoints[..., :2])
             result["keypoints"] = torch.cat((places, points[..., 2:].to(places)), -1)
@@ -198,7 +199,8 @@ def detections_to_images(
                 result[name] = tensor_like(result.get(name, result["boxes"]), column)
         result["cut"] = result["cut"] > 0
         if "masks" in result:
-            result["masks"] = _masks_in_image(result["masks"], torch.from_numpy(tile_of), remap)
+            masks = _whole_masks(result["masks"], in_view, remap.view_size)
+            result["masks"] = _masks_in_image(masks, torch.from_numpy(tile_of), remap)
         results.append(result)
     return results
 
@@ -236,6 +238,15 @@ def _instances(detections: Mapping[str, Tensor]) -> Instances:
         for name in ("boxes", "scores", "labels", "keypoints") if name in detections
     }  # fmt: skip
     return Instances(**columns)
+
+
+def _whole_masks(masks: Tensor, boxes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Masks (K, 1, H', W') of views, also if they are given for each box alone."""
+    from darswin.frames.forms import whole_masks  # needs the compiled part of frames
+
+    planes = to_numpy(masks.flatten(0, -3).float())
+    whole = whole_masks(planes, to_numpy(boxes.double()), size)
+    return masks if whole is planes else like(masks, whole).view(*masks.shape[:-2], *size)
 
 
 def _masks_in_image(masks: Tensor, tiles: Tensor, remap: Remap) -> Tensor:
