@@ -92,15 +92,19 @@ class Instances:
 
         If some boxes are turned, all are. Keypoints get rows of NaN up to the largest number of
         points, and masks and outlines of parts without them are unknown. Of `more`, the columns
-        that all have stay.
+        that all have stay. If all have "cut", "view" (K,) is the number of the part, by which
+        `merged` tells the parts of a thing from its neighbours.
 
         Raises:
             ValueError: some parts with rows have scores or labels, and others have none; or some
                 keypoints have 2 columns, and others 3.
         """
-        parts = [part for part in parts if len(part)] or parts[:1]
         if not parts:
             return cls(np.zeros((0, 4)), labels=np.zeros(0, int))
+        parts = [
+            part.with_columns(view=np.full(len(part), k)) if "cut" in part.more else part
+            for k, part in enumerate(parts) if len(part)
+        ] or parts[:1]  # fmt: skip
         columns = {name: [getattr(part, name) for part in parts] for name, _ in parts[0]._columns()}
         if len({table.shape[1] for table in columns["boxes"]}) > 1:
             columns["boxes"] = [as_turned(table) for table in columns["boxes"]]
@@ -121,8 +125,8 @@ class Instances:
         """The best of those that show the same thing, the best first; see `darswin.boxes.merge`.
 
         A box that the border of its view cuts ("cut" of `through`) is left out if a larger whole
-        one covers a third of it, which gets the higher score of both. Other cut boxes of one thing
-        are joined. Masks and keypoints are those of the best part.
+        one of another view covers half of it, and this one gets the higher score of both. Other cut
+        boxes of one thing are joined. Masks and keypoints are those of the best part.
 
         Raises:
             ValueError: there are no scores or no labels.
@@ -130,8 +134,9 @@ class Instances:
         if self.scores is None or self.labels is None:
             raise ValueError("instances need scores and labels to be merged")
         boxes, scores = self.boxes, floats(self.scores)
-        if "cut" in self.more:
-            boxes, scores = mend(boxes, scores, np.asarray(self.labels), self.more["cut"])
+        if {"cut", "view"} <= {*self.more}:
+            of = np.asarray(self.labels), self.more["cut"], self.more["view"]
+            boxes, scores = mend(boxes, scores, *of)
         kept = merge(boxes, scores, self.labels, iou=iou, inside=inside)
         return replace(self, boxes=boxes, scores=scores)[kept]
 

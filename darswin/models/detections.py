@@ -128,9 +128,9 @@ def in_picture(remap: Remap, tiles: Sequence[Instances]) -> Instances:
         tiles: for each tile, its detections with scores and labels, in px of the tile.
 
     Returns:
-        Instances without masks. `more` gets "visible", "cut", "rays" if the view uses the lens,
-        and "source" (K, 2): of each detection, its tile and its row there, by which masks can
-        follow.
+        Instances without masks. `more` gets "visible", "cut", "view" of several tiles, "rays" if
+        the view uses the lens, and "source" (K, 2): of each detection, its tile and its row there,
+        by which masks can follow.
     """
     parts = []
     for number, (tile, detections) in enumerate(zip(remap.tiles, tiles, strict=True)):
@@ -195,7 +195,7 @@ def detections_to_images(
         better = tensor_like(result["scores"], moved.scores)  # of the parts of the thing
         result["scores"] = torch.where(result["scores"] < better, better, result["scores"])
         for name, column in {"boxes": moved.boxes, **moved.more}.items():
-            if name != "source":
+            if name not in ("source", "view"):
                 result[name] = tensor_like(result.get(name, result["boxes"]), column)
         result["cut"] = result["cut"] > 0
         if "masks" in result:
