@@ -79,7 +79,7 @@ def form_of(network: Network, word: str | None = None) -> Form | None:
         forms = [form for form in forms if form.name == word]
     elif best == PERHAPS:
         text = f"their form may be {' or '.join(words)}: say which by `form`, or keep what tells "
-        text += "it: `task` and `names` of Ultralytics, or the config.json of transformers"
+        text += "it: the task and names of Ultralytics, or the config of transformers"
         raise naming(ValueError(text), "form")
     for form in forms[:1]:
         count = network.outputs[form.where["boxes"][0]].shape[-1 if form.things_last else -2]

@@ -12,6 +12,7 @@ from darswin.boxes import Instances
 from darswin.boxes.arrays import like, to_numpy
 from darswin.boxes.turned import as_turned
 from darswin.models.prepared import Prepared
+from darswin.utils.parameters import naming
 from darswin.views import PixelView, Remap, View
 from darswin.views.remap import tensor_like
 
@@ -78,26 +79,26 @@ def decode_detections(
     Raises:
         ValueError: they look like those of a detector, but have several forms or no known one.
     """
+    outputs, leaves = _outputs(results), pytree.tree_leaves(results)
+    says = (network, getattr(network, "config", None))
+    told = {name: getattr(by, name) for by in says for name in _TOLD if hasattr(by, name)}
+    tables = [of for of in outputs.values() if of.dim() == 3 and of.is_floating_point()]
+    objects = [leaf for leaf in leaves if not isinstance(leaf, Tensor)]
+    is_detector = any(hasattr(leaf, name) for leaf in objects for name in _OBJECTS)
+    if word == "numbers" or not (tables or is_detector or word or "task" in told):
+        return None
     from darswin.frames.forms import decode, grids  # need the compiled part of frames
     from darswin.frames.recognise import TASKS, Network, form_of, names_of
 
     count, size = len(pictures), (pictures.shape[2], pictures.shape[3])
-    outputs, leaves = _outputs(results), pytree.tree_leaves(results)
+    sides = {side for table in tables for side in table.shape[1:]}
+    is_detector |= told.get("task") in TASKS or not sides.isdisjoint(grids(size))
+    if torch.compiler.is_compiling():  # values are not known, and detections are refused later
+        return [{}] * count if is_detector else None
     quarter = (size[0] // 4, size[1] // 4)
     protos = [of for of in leaves if isinstance(of, Tensor) and of.shape[2:] == quarter]
     if len(protos) == 1 and all(of is not protos[0] for of in outputs.values()):
         outputs["protos"] = protos[0]
-    says = (network, getattr(network, "config", None))
-    told = {name: getattr(by, name) for by in says for name in _TOLD if hasattr(by, name)}
-    tables = [of for of in outputs.values() if of.dim() == 3 and of.is_floating_point()]
-    sides = {side for table in tables for side in table.shape[1:]}
-    is_detector = told.get("task") in TASKS or not sides.isdisjoint(grids(size))
-    objects = [leaf for leaf in leaves if not isinstance(leaf, Tensor)]
-    is_detector |= any(hasattr(leaf, name) for leaf in objects for name in _OBJECTS)
-    if word == "numbers" or not (tables or is_detector or word):
-        return None
-    if torch.compiler.is_compiling():  # values are not known, and detections are refused later
-        return [{}] * count if is_detector else None
     arrays = {name: to_numpy(of.float() if of.is_floating_point() else of)
               for name, of in outputs.items()}  # fmt: skip
     batched = [name for name, of in arrays.items() if of.shape[:1] == (count,)]
@@ -113,7 +114,8 @@ def decode_detections(
         shapes = ", ".join(str(tuple(of.shape)) for of in outputs.values()) or "no tensors"
         text = f"the network's results are {shapes}: {error}. `boxes` makes detections of them"
         text += ", and eval() of the network may help" * network.training
-        raise ValueError(text + "; with form='numbers' they are returned as they are") from error
+        text += "; with form='numbers' they are returned as they are"
+        raise naming(ValueError(text), "boxes") from error
     return None
 
 
