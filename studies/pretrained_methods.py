@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,8 @@ from pretrained_files import MODELS, Files
 from pretrained_graphs import DETECTORS, export
 from pretrained_scenes import LENSES, SIZE, WRONG, Shot, spherical
 
-from darswin import boxes, frames
+from darswin import frames
+from darswin.boxes import Instances
 from darswin.deploy import camera
 from darswin.lens import Lens
 from darswin.views import make_view
@@ -160,6 +161,8 @@ class Found(NamedTuple):
     scores: np.ndarray  # (K,)
     labels: np.ndarray  # (K,), numbers of COCO's classes
     visible: np.ndarray  # (K,), the share of the box that the picture shows
+    cut: np.ndarray  # (K,), bool: it ends at the border of a tile or a slice
+    view: np.ndarray  # (K,), the number of the tile or slice
 
 
 class Detector:
@@ -228,22 +231,30 @@ def detect(look: Look, scene: Shot, picture: np.ndarray, detector: Detector) -> 
     """The detections of a look, in the picture's pixels."""
     parts = []
     if look.view == "raw":
-        for x, y, side in squares(look):
+        for k, (x, y, side) in enumerate(squares(look)):
             image = picture[y : y + side, x : x + side]
             how = cv2.INTER_AREA if side > look.size[0] else cv2.INTER_LINEAR
             image = cv2.resize(image, look.size[::-1], interpolation=how)
             found, scores, labels = detector(detector.normalised(image))
+            seen = Instances(found).through(lambda xy: xy, look.size, cut=look.size)
+            cut = seen.more["cut"] & (side < SIZE)
             found = found * (side / look.size[0]) + np.array([x, y, x, y], found.dtype)
-            parts.append(Found(found, scores, labels, np.ones(len(scores))))
+            ones = np.ones(len(scores))
+            parts.append(Found(found, scores, labels, ones, cut, k * ones))
         return joined(parts)
     sampler = sampler_of(look, scene, detector)
     seen = sampler(picture)
     for tile, image in enumerate(seen if seen.ndim == 4 else seen[None]):
-        found, scores, labels = detector(image)
-        carried, visible = boxes.carry(found, lambda xy, k=tile: sampler.plan.points(xy, k))
-        kept = visible > 0
-        parts.append(Found(*(of[kept] for of in (carried, scores, labels, visible))))
-    return joined(parts)
+        points_map = partial(sampler.plan.points, tile=tile)
+        found = Instances(*detector(image)).through(points_map, (SIZE, SIZE), cut=look.size)
+        parts.append(columns_of(found.with_columns(view=np.full(len(found), tile))))
+    found = joined(parts)
+    return Found(*(of[found.visible > 0] for of in found))
+
+
+def columns_of(found: Instances) -> Found:
+    more = (found.more[name] for name in ("visible", "cut", "view"))
+    return Found(found.boxes, found.scores, found.labels, *more)
 
 
 def squares(look: Look) -> list[tuple[int, int, int]]:
@@ -268,15 +279,15 @@ def joined(parts: list[Found]) -> Found:
 
 
 def merged(parts: list[Found]) -> Found:
-    """The detections of several views, without those that overlap a better one."""
-    found = joined(parts)
-    order = boxes.merge(found.boxes, found.scores, found.labels)
-    return Found(*(of[order] for of in found))
+    """The detections of several views, each thing once."""
+    found = joined([of._replace(view=of.view + 100 * k) for k, of in enumerate(parts)])
+    more = dict(visible=found.visible, cut=found.cut, view=found.view)
+    return columns_of(Instances(*found[:3], more=more).merged())
 
 
 def look_file(folder: Path, look: Look, detector: Detector) -> Path:
     """The file that keeps the detections of a look of a scene."""
-    told = [detector.name, asdict(look)]
+    told = [detector.name, asdict(look), Found._fields]
     if look.view == "tiles":  # what "count" means may change
         parts = make_view("tiles", look.size, **look.options).tiles
         told += [[tile.direction, tile.fov] for tile in parts]

@@ -6,9 +6,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from darswin.boxes.arrays import PointMap, table_of
+from darswin.boxes.arrays import PointMap, floats, table_of
 from darswin.boxes.carried import carry, carry_points, cut_polygon
-from darswin.boxes.overlap import clip, merge
+from darswin.boxes.overlap import clip, mend, merge
 from darswin.boxes.regions import NO_AREA, area_of, box_of, box_of_mask, shown_parts
 from darswin.boxes.rle import decode_rle, encode_rle
 from darswin.boxes.turned import as_turned, upright
@@ -16,6 +16,7 @@ from darswin.boxes.turned import as_turned, upright
 Size = tuple[int, int]
 Column = Any  # an array or a list of K values, or None
 _SAMPLES = 1000  # pixels of a mask by which its visible share is measured
+_BORDER = 0.01  # of the longer side of a view: boxes that end so near to its border may be cut
 _ROUNDING = 1e-3  # px: a keypoint that is this little beyond the edge of a picture is on it
 
 
@@ -91,15 +92,19 @@ class Instances:
 
         If some boxes are turned, all are. Keypoints get rows of NaN up to the largest number of
         points, and masks and outlines of parts without them are unknown. Of `more`, the columns
-        that all have stay.
+        that all have stay. If all have "cut", "view" (K,) is the number of the part, by which
+        `merged` tells the parts of a thing from its neighbours.
 
         Raises:
             ValueError: some parts with rows have scores or labels, and others have none; or some
                 keypoints have 2 columns, and others 3.
         """
-        parts = [part for part in parts if len(part)] or parts[:1]
         if not parts:
             return cls(np.zeros((0, 4)), labels=np.zeros(0, int))
+        parts = [
+            part.with_columns(view=np.full(len(part), k)) if "cut" in part.more else part
+            for k, part in enumerate(parts) if len(part)
+        ] or parts[:1]  # fmt: skip
         columns = {name: [getattr(part, name) for part in parts] for name, _ in parts[0]._columns()}
         if len({table.shape[1] for table in columns["boxes"]}) > 1:
             columns["boxes"] = [as_turned(table) for table in columns["boxes"]]
@@ -119,12 +124,21 @@ class Instances:
     def merged(self, *, iou: float = 0.5, inside: float = 0.7) -> Self:
         """The best of those that show the same object, best first; see `darswin.boxes.merge`.
 
+        A box that the border of its view cuts ("cut" of `through`) is left out if a larger whole
+        one of another view covers half of it, and this one gets the higher score of both. Other cut
+        boxes of one thing are joined. Masks and keypoints are those of the best part.
+
         Raises:
             ValueError: there are no scores or no labels.
         """
         if self.scores is None or self.labels is None:
             raise ValueError("instances need scores and labels to be merged")
-        return self[merge(self.boxes, self.scores, self.labels, iou=iou, inside=inside)]
+        boxes, scores = self.boxes, floats(self.scores)
+        if {"cut", "view"} <= {*self.more}:
+            of = np.asarray(self.labels), self.more["cut"], self.more["view"]
+            boxes, scores = mend(boxes, scores, *of)
+        kept = merge(boxes, scores, self.labels, iou=iou, inside=inside)
+        return replace(self, boxes=boxes, scores=scores)[kept]
 
     @property
     def upright(self) -> np.ndarray:
@@ -171,16 +185,20 @@ class Instances:
 
         Returns:
             The instances with "visible" (K,), the share that is shown, multiplied by the share that
-            was visible before; and with "rays" (K, 3) if `rays` is given: the directions of the
-            middles of the boxes here, 0 where there are none. Of what is not shown at all, boxes
-            are NaN.
+            was visible before; with "cut" (K,) bool if `cut` is given: whether a box ends at the
+            border of this picture, beyond which its thing may go on; and with "rays" (K, 3) if
+            `rays` is given: the directions of the middles of the boxes here, 0 where there are
+            none. Of what is not shown at all, boxes are NaN.
         """
-        old = self.boxes
+        old, more = self.boxes, dict(self.more)
         if cut is not None:
             clipped = clip(self.upright, cut)
             sides = np.hstack((clipped[:, 2:] - clipped[:, :2], as_turned(old)[:, 2:4]))
-            clipped = clipped if old.shape[1] == 4 else old
-            old = np.where((sides > 0).all(1, keepdims=True), clipped, np.nan)
+            shown = (sides > 0).all(1, keepdims=True)
+            old = np.where(shown, clipped if old.shape[1] == 4 else old, np.nan)
+            near = _BORDER * max(cut)
+            ends = (clipped[:, :2] < near) | (clipped[:, 2:] > np.subtract(cut[::-1], near))
+            more["cut"] = ends.any(1) | more.get("cut", False)
         by_mask = _known(None if masks is None else self.masks, len(old))
         by_outline = _known(self.outlines, len(old)) & ~by_mask
         alone = ~(by_mask | by_outline)
@@ -203,7 +221,7 @@ class Instances:
                 columns["masks"][k] = encode_rle(mask, compressed=compressed)
         if old.shape[1] == 5:
             boxes[~alone] = as_turned(boxes[~alone, :4])
-        more = dict(self.more) | {"visible": visible * self.more.get("visible", 1.0)}
+        more["visible"] = visible * more.get("visible", 1.0)
         if rays is not None:
             more["rays"] = np.nan_to_num(rays(as_turned(old)[:, :2] - 0.5))
         columns["keypoints"] = _keypoints_through(self.keypoints, points_map, size)

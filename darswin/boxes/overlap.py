@@ -7,6 +7,8 @@ import numpy as np
 from darswin.boxes.arrays import Array, floats, like, shape_of, table_of, to_numpy
 from darswin.boxes.turned import as_turned, common_area, upright
 
+_HALF = 0.5  # of a box that a view cuts, beyond which another one shows the same thing
+_LEAST = 0.3  # of its score, which the other one must have
 _ROWS = 128  # boxes that are compared with all worse ones at once
 
 
@@ -76,6 +78,40 @@ def merge(
             if kept[best]:
                 kept[dropped] = False
     return like(boxes, order[kept])
+
+
+def mend(
+    boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, cut: np.ndarray, view: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The boxes (K, 4 or 5) and scores (K,) of detections in several views, whose borders cut some:
+    (K,) bool. The scores of parts of things that another detection stands for are NaN.
+
+    A whole box that is larger than a cut one of another view and covers half of it shows the same
+    thing, and gets the higher score of both. Other upright boxes that are cut by two views and have
+    half of the smaller one in common are joined. In both cases, the box that stays, or joins, has
+    at least 0.3 of the score of the better one: much weaker ones are mostly wrong.
+    """
+    boxes, area = boxes.copy(), _area(boxes)
+    scores = np.where(np.isfinite(boxes).all(1), scores, np.nan)
+    parts = np.flatnonzero(cut)[np.argsort(-scores[cut], kind="stable")].tolist()
+    for k in parts:
+        common = _common(boxes[k], boxes)
+        shows = (labels == labels[k]) & (view != view[k]) & (scores >= _LEAST * scores[k])
+        shows &= ~cut & (area >= area[k]) & (common > _HALF * area[k])
+        if shows.any():
+            best = np.where(shows, common, 0).argmax()
+            scores[best], scores[k] = max(scores[best], scores[k]), np.nan
+    for k in parts if boxes.shape[1] == 4 else ():
+        joins = cut & (labels == labels[k]) & (view != view[k])
+        while True:
+            least = np.minimum(_area(boxes[k]), area)
+            more = joins & (_common(boxes[k], boxes) > _HALF * least)
+            more &= (scores <= scores[k]) & (scores >= _LEAST * scores[k])
+            if not more.any():
+                break
+            low, high = np.vstack((boxes[k], boxes[more])).reshape(-1, 2, 2).swapaxes(0, 1)
+            boxes[k], scores[more] = (*low.min(0), *high.max(0)), np.nan
+    return boxes, scores
 
 
 def _area(boxes: np.ndarray) -> np.ndarray:

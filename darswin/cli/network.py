@@ -340,6 +340,7 @@ def _entries(
         "score": rounded(detections.scores, 4),
         "box": rounded(detections.upright, 2),
         "visible": rounded(detections.more["visible"], 4),
+        "cut": detections.more["cut"].tolist(),
     }
     for angle in ("azimuth", "elevation", "width", "height"):
         columns[f"{angle}_deg"] = rounded(np.degrees(getattr(there, angle)), 3)

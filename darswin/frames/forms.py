@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from darswin.boxes import Instances
+from darswin.boxes.turned import upright
 
 Outputs = Mapping[str, np.ndarray]
 Size = tuple[int, int]
@@ -63,7 +64,7 @@ def grids(size: Size) -> dict[int, tuple[tuple[int, ...], int]]:
     """The strides of the grids that have so many cells, and 1, or a third of them, and 3."""
     strides_of: dict[int, tuple[tuple[int, ...], int]] = {}
     for strides in ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32)):
-        count = len(cells(size, strides))
+        count = sum(math.ceil(size[0] / of) * math.ceil(size[1] / of) for of in strides)
         strides_of = {count: (strides, 1), 3 * count: (strides, 3)} | strides_of
     return strides_of
 
@@ -239,18 +240,23 @@ def _masks(form: Form, kept: Outputs, boxes: np.ndarray, size: Size) -> np.ndarr
         return None
     if "protos" in kept or form.scores:
         masks = 1 / (1 + np.exp(-masks))
+    if "masks" in kept:
+        return whole_masks(masks, boxes, size)
+    # Those that all share have meaning inside the box only.
+    x0, y0, x1, y1 = boxes.T[..., None, None] * masks.shape[1] / size[0] - 0.5
+    y, x = np.ogrid[: masks.shape[1], : masks.shape[2]]
+    return masks * ((x0 <= x) & (x < x1) & (y0 <= y) & (y < y1))
+
+
+def whole_masks(masks: np.ndarray, boxes: np.ndarray, size: Size) -> np.ndarray:
+    """Masks (K, h, w) of pictures (H, W), as they are, or made of those of each box alone."""
     scale = size[0] / masks.shape[1]
-    is_whole = scale % 1 == 0 and masks.shape[2] * scale == size[1]
     is_small = scale > 4 and max(masks.shape[1:]) <= _BOX_MASK
-    if "masks" in kept and (is_small or not is_whole):
-        boxes = boxes.clip(-1e6, 1e6)  # they may end nowhere
-        pasted = [*map(partial(_pasted, size=size), masks, boxes)]
-        return np.array(pasted, np.float32).reshape(-1, *size)
-    if "protos" in kept:  # they have meaning inside the box only
-        x0, y0, x1, y1 = boxes.T[..., None, None] / scale - 0.5
-        y, x = np.ogrid[: masks.shape[1], : masks.shape[2]]
-        masks *= (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)
-    return masks
+    if scale % 1 == 0 and masks.shape[2] * scale == size[1] and not is_small:
+        return masks
+    boxes = upright(boxes).clip(-1e6, 1e6)  # they may end nowhere
+    pasted = [*map(partial(_pasted, size=size), masks, boxes)]
+    return np.array(pasted, np.float32).reshape(-1, *size)
 
 
 def _pasted(mask: np.ndarray, box: np.ndarray, size: Size) -> np.ndarray:

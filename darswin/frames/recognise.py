@@ -79,7 +79,7 @@ def form_of(network: Network, word: str | None = None) -> Form | None:
         forms = [form for form in forms if form.name == word]
     elif best == PERHAPS:
         text = f"their form may be {' or '.join(words)}: say which by `form`, or keep what tells "
-        text += "it: the metadata of `yolo export`, or transformers' config.json beside the file"
+        text += "it: the task and names of Ultralytics, or the config of transformers"
         raise naming(ValueError(text), "form")
     for form in forms[:1]:
         count = network.outputs[form.where["boxes"][0]].shape[-1 if form.things_last else -2]
@@ -110,6 +110,12 @@ def imgsz_of(metadata: Mapping[str, Any]) -> tuple[int, int] | None:
     return (int(found[1]), int(found[2])) if found else None
 
 
+def counts_in(outputs: Mapping[str, Any], pictures: int) -> Any | None:
+    """The output that tells how many rows of each picture are things, by its name; or None."""
+    counts = (of for name, of in outputs.items() if _says(name, *_COUNT))
+    return next((of for of in counts if math.prod(of.shape) == pictures), None)
+
+
 def _whole(**names: str | None) -> Where:
     return {key: (name, slice(None)) for key, name in names.items() if name}
 
@@ -138,6 +144,11 @@ def _are_corners(boxes: np.ndarray) -> bool:
 
 def _are_whole(values: np.ndarray) -> bool:
     return not (values % 1).any()
+
+
+def _are_scores(values: np.ndarray) -> bool:
+    """Whether they are from 0 to 1, also if 16 bits round them."""
+    return values.min(initial=0) > -0.01 and values.max(initial=0) < 1.01
 
 
 def _separate(network: Network) -> Candidates:
@@ -176,7 +187,7 @@ def _by_class(network: Network, boxes: str, scores: str, more: Where) -> Candida
     """Boxes (B, N, 4) and scores of each class (B, N, C)."""
     where, values = _whole(boxes=boxes, scores=scores) | more, network.outputs[scores]
     is_named = boxes in ("dets", "pred_boxes")
-    if not is_named and values.min(initial=0) >= 0 and values.max(initial=0) <= 1:
+    if not is_named and _are_scores(values):
         if _are_corners(network.outputs[boxes]):
             yield SURE, Form("boxes", where)
     elif is_named or values.shape[1] not in grids(network.size):
@@ -275,10 +286,12 @@ def _final(network: Network, name: str, masks: int, more: Where) -> Candidates:
     values, task, head = network.outputs[name], network.task, network.metadata.get("head")
     width = values.shape[2]
     in_parts = 0 < values[..., :4].max(initial=0) <= _PART and values.min(initial=0) > -_PART
-    has_class = width == 6 and _are_whole(values[..., 5])
+    ends = _are_scores(values[..., 4]) and _are_whole(values[..., 5]) if width > 5 else False
+    has_class = width == 6 and ends
+    in_parts &= has_class or _are_scores(values[..., 4:])
     is_rtdetr = in_parts if head is None else head == "RTDETRDecoder"
     for how, form in _ultralytics(network, name, width, False, masks, more):
-        yield ASKED if form.name == "detect" and is_rtdetr else how, form
+        yield how if ends and not (form.name == "detect" and is_rtdetr) else ASKED, form
     if width > 4 and not masks and task in (None, "detect"):
         columns = dict(scores=1, labels=1) if has_class else dict(scores=width - 4)
         fits = has_class or width - 4 == network.classes
@@ -287,10 +300,12 @@ def _final(network: Network, name: str, masks: int, more: Where) -> Candidates:
         yield how, Form("rtdetr", _columns(name, boxes=4, **columns) | more, "middle", True)
     if width == 6 and not masks:
         where = _columns(name, boxes=4, scores=1, labels=1) | more
-        yield PERHAPS if in_parts else SURE, Form("table", where)
+        how = PERHAPS if in_parts else SURE
+        yield how if ends else ASKED, Form("table", where)
     if width == 7 and not masks:
         where = _columns(name, number=1, boxes=4, scores=1, labels=1) | more
-        yield SURE if _says(name, "detections") else PERHAPS, Form("efficientdet", where, "rows")
+        how = PERHAPS if _are_scores(values[..., 5]) and _are_whole(values[..., 6]) else ASKED
+        yield SURE if _says(name, "detections") else how, Form("efficientdet", where, "rows")
 
 
 def _ultralytics(

@@ -9,8 +9,13 @@ from torch.utils import _pytree as pytree
 
 from darswin.lens import Lens
 from darswin.models.base import Model, check_given_once
-from darswin.models.detections import detections_to_images, find_detections
+from darswin.models.detections import (
+    decode_detections,
+    detections_to_images,
+    find_detections,
+)
 from darswin.models.prepared import Prepared
+from darswin.utils.parameters import check
 from darswin.views import PixelView, View, make_view
 from darswin.views.base import Pair, PerChannel, size_of
 from darswin.views.remap import Remaps
@@ -26,9 +31,12 @@ class LensAdapter(Model[Any]):
       0; `adapter.prepare(lens, size).view.shown` is their mask;
     - detections, a dict of "boxes", "scores" and "labels" or a list of such dicts for each picture,
       as torchvision returns them, become a list with a dict for each image: boxes in pixels of the
-      images, and "rays" (K, 3), the directions of their middles, and "visible" (K,), the share of
-      each box that the image shows. Their masks and keypoints come back too. The detections of
-      several tiles are merged;
+      images, "rays" (K, 3), the directions of their middles, "visible" (K,), the share of each box
+      that the image shows, and "cut" (K,), whether the border of the view cuts it. Their masks and
+      keypoints come back too. The detections of several tiles are merged;
+    - raw results of a detector, in a form of the how-to about detectors, become detections too.
+      Those of Ultralytics are (B, 4 + n, cells) or (B, 300, 6), alone or before other results.
+      Boxes that overlap are merged. No gradients come back from them;
     - other results, such as logits of classes, are returned as they are. A view of n tiles has n
       for each image. Lists, tuples and dicts of results may be nested.
 
@@ -49,11 +57,15 @@ class LensAdapter(Model[Any]):
         output: "pixels" resamples results with 4 dimensions as described; "view" returns all
             results as the network made them, in the view.
         boxes: a function that makes detections of the network's results, if they have another form.
+        form: that of raw results of a detector, if neither they nor attributes of the network tell
+            it, a word of the how-to about detectors; "numbers" if they are none.
+        threshold: the lowest score of detections in raw results.
 
     Raises:
         ValueError: the size is below 1, an argument is given beside a `View`, the output is
-            unknown, or mean and std do not fit together; in forward, the number of detections does
-            not fit.
+            unknown, mean and std do not fit together, or the form or the threshold is none; in
+            forward, the number of detections does not fit, or results look like those of a
+            detector, but their form cannot be told.
         TypeError: the size is no int and no pair of ints; in forward, images of uint8 without mean
             and std, or results of `boxes` that are no detections.
 
@@ -73,10 +85,18 @@ class LensAdapter(Model[Any]):
         std: PerChannel | None = None,
         output: Literal["pixels", "view"] = "pixels",
         boxes: Callable[[Any], Any] | None = None,
+        form: str | None = None,
+        threshold: float = 0.3,
     ):
         super().__init__()
         if output not in ("pixels", "view"):
             raise ValueError(f"output must be 'pixels' or 'view', got {output!r}")
+        if form is not None:
+            from darswin.frames.recognise import FORMS  # needs the compiled part of frames
+
+            check("form", form, form in FORMS, f"one of {', '.join(FORMS)}")
+            check("form", form, boxes is None, "left out beside boxes")
+        check("threshold", threshold, 0 <= threshold <= 1, "from 0 to 1")
         if isinstance(view, View):
             check_given_once(size=size, mean=mean, std=std)
         else:
@@ -84,6 +104,7 @@ class LensAdapter(Model[Any]):
         size_of(view)  # or an error, if it is not of pixels
         self.view = view
         self.network, self.output, self.boxes = network, output, boxes
+        self.form, self.threshold = form, threshold
         self.goes_back = output == "pixels"
         if isinstance(network, Model):
             self.in_chans, self.num_classes = network.in_chans, network.num_classes
@@ -103,6 +124,8 @@ class LensAdapter(Model[Any]):
         if self.output == "view":
             return results
         detections = find_detections(results)
+        if detections is None and self.boxes is None:
+            detections = decode_detections(results, x, self.network, self.form, self.threshold)
         if detections is not None:
             if len(detections) != len(x):
                 raise ValueError(

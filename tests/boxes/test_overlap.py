@@ -186,3 +186,43 @@ def test_a_part_stays_if_nothing_is_inside_enough():
 def test_boxes_end_at_the_border():
     cut = boxes.clip([[-5, 2, 30, 50], [40, -9, 45, -3], [np.nan] * 4], (20, 25))
     np.testing.assert_array_equal(cut, [[0, 2, 25, 20], [25, 0, 25, 0], [np.nan] * 4])
+
+
+def test_what_views_cut_is_one_thing():
+    """A cut box loses against a larger whole one of another view, and cut ones are joined."""
+    whole, left, right = [0.0, 0, 100, 40], [0.0, 0, 60, 40], [20.0, 0, 100, 40]
+    far = [300.0, 0, 400, 40]
+    for rows, scores, cuts, views, expected in (
+        # the whole one has the lower score, and gets the higher one
+        ([left, whole], [0.9, 0.4], [1, 0], [0, 1], [(whole, 0.9)]),
+        ([left, whole], [0.9, 0.2], [1, 0], [0, 1], [(left, 0.9)]),  # much too low: merged by IoU
+        ([left, whole], [0.9, 0.4], [0, 0], [0, 1], [(left, 0.9)]),
+        ([whole, left], [0.9, 0.4], [1, 0], [0, 1], [(whole, 0.9)]),  # the whole one is smaller
+        ([left, right], [0.9, 0.5], [1, 1], [0, 1], [(whole, 0.9)]),
+        ([left, right, far], [0.5, 0.9, 0.7], [1, 1, 1], [0, 1, 1], [(whole, 0.9), (far, 0.7)]),
+        # of one view, they are two things
+        ([left, right], [0.9, 0.5], [1, 1], [2, 2], [(left, 0.9), (right, 0.5)]),
+        ([right, left], [0.9, 0.5], [0, 1], [2, 2], [(right, 0.9), (left, 0.5)]),
+        ([[0.0, 0, 20, 40], whole], [0.9, 0.5], [1, 0], [0, 1], [(whole, 0.9)]),
+        ([left, [np.nan] * 4], [0.9, 0.95], [1, 1], [0, 1], [(left, 0.9)]),
+    ):
+        columns = np.array(rows), np.array(scores), np.zeros(len(rows), int)
+        more = dict(cut=np.array(cuts, bool), view=np.array(views))
+        found = boxes.Instances(*columns, more=more).merged()
+        assert found.boxes.tolist() == [box for box, _ in expected]
+        assert found.scores.tolist() == [score for _, score in expected]
+        columns = *columns[:2], np.arange(len(rows))  # other classes
+        assert len(boxes.Instances(*columns, more=more).merged()) == np.isfinite(rows).all(1).sum()
+        turned = boxes.Instances(boxes.turned(np.array(rows)), *columns[1:], more=more)
+        assert len(turned.merged()) == np.isfinite(rows).all(1).sum()
+
+
+def test_a_box_at_the_border_of_a_view_is_cut():
+    ends = np.array([[10.0, 10, 50, 50], [0, 10, 50, 50], [10, 10, 199, 50], [10, 10, 50, 120]])
+    parts = [boxes.Instances(ends).through(lambda p, d=d: p + d, (900, 900), cut=(100, 200))
+             for d in (0, 300)]  # fmt: skip
+    found = boxes.Instances.joined(parts)
+    assert found.more["cut"].tolist() == [False, True, True, True] * 2
+    assert found.more["view"].tolist() == [0] * 4 + [1] * 4
+    again = found.through(lambda p: p, (900, 900), cut=(900, 900))  # what was cut stays cut
+    assert again.more["cut"].tolist() == found.more["cut"].tolist()

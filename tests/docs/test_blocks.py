@@ -260,7 +260,7 @@ def check_detector(*after: dict) -> None:
     """A detector finds the same with torch, without it and by the command."""
     *_, scope = after
     with_torch = scope["found"]["boxes"][scope["found"]["scores"] > 0.3]
-    alone = scope["there"][scope["best"]]
+    alone = scope["best"].boxes
     (entry,) = json.loads(Path("found/predictions.json").read_text())
     by_command = [found["box"] for found in entry["detections"]]
     assert len(by_command) > 3 and entry["detections"][0]["score"] > 0.5
@@ -269,6 +269,14 @@ def check_detector(*after: dict) -> None:
     np.testing.assert_allclose(by_command, with_torch, atol=0.02)
     drawn = [cv2.imread(name) for name in ("found.jpg", "without_torch.jpg")]
     assert all(np.abs(one - cv2.imread("examples/parking.jpg")).max() > 100 for one in drawn)
+
+
+def check_yolo(*after: dict) -> None:
+    """One command finds things on both cameras, and both data sets have labels in tiles."""
+    pictures = json.loads(Path("found/predictions.json").read_text())
+    assert len(pictures) == 2 and all(picture["detections"] for picture in pictures)
+    for name in ("left", "right"):
+        assert any(file.read_text() for file in Path(f"training/{name}/labels").rglob("*.txt"))
 
 
 def check_answers(*answers: dict) -> None:
@@ -306,4 +314,5 @@ RESULTS: dict[str, Callable] = {
     "answers": check_answers,
     "detector": check_detector,
     "sampling": check_sampling,
+    "yolo": check_yolo,
 }

@@ -6,19 +6,28 @@ Each form is written here as its exporter writes it, without the code that reads
 import itertools
 import json
 import math
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from helpers import refused, slow_but
+from torch import nn
+from torch.utils import _pytree as pytree
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 from graphs import write_detector
 
+from darswin.boxes import Instances
 from darswin.frames.forms import decode
 from darswin.frames.onnx import OnnxNetwork
 from darswin.frames.recognise import Network, form_of
+from darswin.lens import Spherical
+from darswin.models import LensAdapter
+from darswin.views import make_view
 
 pytestmark = pytest.mark.unsanitized  # nothing of it is compiled
 
@@ -380,6 +389,93 @@ def test_every_form_is_found(tmp_path, form, dtype):
         assert len(found) == 3
         for one in found:
             check_known(form, one, **near)
+
+
+class Returns(nn.Module):
+    """A network with these results, and attributes that tell what it is."""
+
+    def __init__(self, results, told):
+        super().__init__()
+        self.results = results
+        vars(self).update(told)
+
+    def forward(self, pictures):
+        of_each = partial(expanded, count=len(pictures))
+        return pytree.tree_map_only(torch.Tensor, of_each, self.results)
+
+
+def expanded(of, count):
+    return of.expand(count, *of.shape[1:])
+
+
+def by_adapter(results, told=None, view="none", **options):
+    """What an adapter finds: in the pixels of the network, if the view is the picture itself."""
+    adapter = LensAdapter(Returns(results, told or {}), view=make_view(view, SIZE), **options)
+    lens = Spherical.from_fov(0.5, 2.8, 80.0, image_size=SIZE)
+    return adapter.eval()(torch.zeros(1, 3, *SIZE), lens)
+
+
+def check_found(form, found):
+    names = ("boxes", "scores", "labels", "keypoints", "masks")
+    columns = {name: found[name].double().numpy() for name in names if name in found}
+    if "masks" in columns:
+        columns["masks"] = masks = columns["masks"][:, 0]
+        if "masks of boxes" not in form:  # at the middles of the pixels that the network gave
+            blocks = masks.reshape(K, HEIGHT // 4, 4, WIDTH // 4, 4)
+            columns["masks"] = blocks[:, :, 1:3, :, 1:3].mean((2, 4))
+    check_known(form, Instances(**columns))
+
+
+# That one has parts of the picture by the names of pixels, as no network of torch returns them.
+@pytest.mark.parametrize("form", [form for form in FORMS if form != "RT-DETR"])
+def test_an_adapter_reads_the_same_forms_in_torch(form):
+    outputs, how = FORMS[form]
+    told = how.get("metadata", {}) | {"config": SimpleNamespace(id2label=NAMES, **how)}
+    results = {name: torch.tensor(np.asarray(value))[None] for name, value in outputs.items()}
+    (found,) = by_adapter(results, told, form=how.get("form"), threshold=0.35)
+    check_found(form, found)
+
+
+def test_an_adapter_reads_what_networks_of_ultralytics_return():
+    """A table alone, or before maps and other results; and masks, wherever they are."""
+    told = dict(task="detect", names=NAMES)
+    heads = [torch.rand(1, 144, HEIGHT // s, WIDTH // s) for s in (8, 16, 32)]
+    table, ended, shared = (torch.tensor(of)[None] for of in (
+        yolo(beside(CENTRED, one_hot(80))), full(ROWS), -protos(64)))  # fmt: skip
+    masked = torch.tensor(yolo(beside(CENTRED, one_hot(80), WEIGHTS)))[None]
+    for results, of in (
+        (table, told), ((table, heads), told), ([table, {"feats": heads}], {"names": NAMES}),
+        ((ended, {"one2many": heads}), {}), (ended, told),
+        ((masked, (heads, masked[:, -64:], shared)), dict(task="segment", names=NAMES)),
+        (((masked, shared), {"feats": heads, "proto": shared}), dict(names=NAMES)),
+    ):  # fmt: skip
+        (found,) = by_adapter(results, of, threshold=0.35)
+        check_found("segment" if "masks" in found else "detect", found)
+        assert len(by_adapter(results, of, "tiles")) == 1
+    refused("may be detect or obb: say which by `form`", by_adapter, (table, heads), view="tiles")
+    refused(r"\(1, 84, 735\).*`boxes` makes", by_adapter, table)
+    for results, of in (
+        (heads, told),  # in training
+        ({"boxes": table[:, :4], "scores": table[:, 4:]}, {}),
+        (table[:, :2], {}),
+        (SimpleNamespace(boxes=table), {}),
+    ):
+        refused("of no known form.*`boxes` makes detections", by_adapter, results, of)
+
+
+def test_an_adapter_leaves_what_are_no_detections():
+    random = torch.Generator().manual_seed(3)
+    for more in ((10,), (197, 64), (10, 4), (10, 6), (10, 7), (50, 57), (9, 2)):
+        features = torch.randn((1, *more), generator=random)
+        for results in (features, (features, features[:, :1]), {"a": [features], "b": features}):
+            found = by_adapter(results, view="tiles")
+            expected = pytree.tree_map(partial(expanded, count=5), results)
+            torch.testing.assert_close(found, expected)
+    table = torch.tensor(yolo(beside(CENTRED, one_hot(80))))[None]
+    assert by_adapter(table, view="tiles", form="numbers").shape == (5, *table.shape[1:])
+    refused("`form` must be one of detect, pose", by_adapter, table, form="yolo")
+    refused("`form` must be one that its outputs may have", by_adapter, table, form="table")
+    refused("`threshold` must be from 0 to 1, got 30", by_adapter, table, threshold=30)
 
 
 @pytest.mark.parametrize("form", ALL)

@@ -236,3 +236,16 @@ def test_prepared_lenses_and_one_for_each_image():
     for k, found in enumerate(together):
         (alone,) = detector(images[k : k + 1], both[k])
         torch.testing.assert_close(found, alone)
+
+
+@torch.no_grad()
+def test_masks_of_each_box_alone_come_to_their_boxes():
+    """As the heads of Mask R-CNN make them, whatever their box is."""
+    box, upper = torch.tensor([[40.0, 30, 140, 190]]), torch.zeros(1, 1, 28, 28)
+    upper[:, :, :14] = 1
+    out = _Constant(box)(None) | dict(masks=upper)
+    adapter = LensAdapter(nn.Identity(), view="none", boxes=lambda _: [out])
+    (found,) = adapter(torch.zeros(1, 3, *SIZE), LENSES["radial"])
+    known = torch.zeros(SIZE, dtype=torch.bool)
+    known[30:110, 40:140] = True
+    assert ((found["masks"][0, 0] > 0.5) != known).sum() < 0.01 * known.sum()
