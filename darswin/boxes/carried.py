@@ -131,7 +131,8 @@ def _least(values: np.ndarray) -> np.ndarray:
     row, k = np.arange(len(values)), values.argmin(1).clip(1, values.shape[1] - 2)
     last, least, ahead = (values[row, k + step] for step in (-1, 0, 1))
     bend = last - 2 * least + ahead
-    below = np.divide((ahead - last) ** 2, 8 * bend, out=np.zeros(len(row)), where=bend > 0)
+    bends = (bend > 0) & (bend < np.inf)  # with neighbours that are seen
+    below = np.divide((ahead - last) ** 2, 8 * bend, out=np.zeros(len(row)), where=bends)
     best = np.minimum(np.minimum(last, ahead), least)
     return np.where(below < 0.1 * (values.max(1) - best), least - below, best)  # not at a seam
 
