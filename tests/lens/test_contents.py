@@ -159,7 +159,7 @@ def test_binary_files_that_are_wrong(tmp_path):
 
     for length in range(8, len(whole), 31):
         assert "it ends within camera" in error_of(whole[:length])
-    assert "it has 3 extra bytes after its 17 cameras" in error_of(whole + b"abc")
+    assert "it has 3 extra bytes after the last camera" in error_of(whole + b"abc")
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])
     assert "to 16 (EUCM), got 17" in error_of(whole[:12] + bytes([17]) + whole[13:])
     random.seed(0)

@@ -429,7 +429,7 @@ def test_skipped_pictures_are_counted(tmp_path, capsys):
     more = ["--trainer.enable_progress_bar", "true", "--devices", "1"]
     fit(run, *start, "--data.skip_broken", "true", *more)
     said = capsys.readouterr()
-    assert "6 pictures could not be read" in said.out
+    assert "they cannot be read: 6 pictures" in said.out
     counts = re.search(r"; (\d+) training and (\d+) validation pictures", said.err).groups()
     assert sum(map(int, counts)) == 30 - 3 - 6  # without those of the test set
     assert "train/loss" in said.out and "v_num" not in said.out
