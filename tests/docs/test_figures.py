@@ -84,8 +84,8 @@ def draw_dense_pictures(path: Path) -> None:
 
 
 def draw_detections(path: Path) -> None:
-    one = np.ones(1)
-    found = pretrained_tables.Found(np.array([[300.0, 300, 700, 700]]), one, np.array([0]), one)
+    box, one, zero = np.array([[300.0, 300, 700, 700]]), np.ones(1), np.zeros(1, int)
+    found = pretrained_tables.Found(box, one, labels=zero, visible=one, cut=zero, view=zero)
     pretrained_tables.draw_found([(PICTURE, [found] * 3)] * 2, path)
 
 

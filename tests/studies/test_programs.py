@@ -155,7 +155,7 @@ def test_estimates(tmp_path, monkeypatch):
     assert abs(of["all"]["KannalaBrandt"]["error"]) < 5
     seen, black = of["single"]["Spherical"]
     holds = seen["low"] <= seen["true"] <= seen["high"]
-    assert "lines" in black["refused"] and seen["holds"] == holds
+    assert "straight" in black["refused"] and seen["holds"] == holds
     assert of["digits"]["single"][1] is None and of["long"][0] > of["long"][1] == 0
     digits = of["digits"]
     assert digits["true"] > 92
