@@ -11,11 +11,11 @@ import numpy as np
 
 from darswin.frames.forms import RGB, Form, Outputs, Pixels, Size, Where, cells, grids, orders_of
 from darswin.utils.parameters import check, naming
+from darswin.utils.tasks import DETECTOR_TASKS
 
-TASKS = ("detect", "pose", "obb", "segment")  # of Ultralytics
 FORMS = (
-    *TASKS, "rtdetr", "yolov5", "yolov6", "yolox", "nanodet", "rfdetr", "softmax", "sigmoid",
-    "boxes", "table", "flat", "tensorflow", "mmdeploy", "efficientdet", "ssd", "numbers",
+    *DETECTOR_TASKS, "rtdetr", "yolov5", "yolov6", "yolox", "nanodet", "rfdetr", "softmax",
+    "sigmoid", "boxes", "table", "flat", "tensorflow", "mmdeploy", "efficientdet", "ssd", "numbers",
 )  # fmt: skip
 _IMAGENET = Pixels((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 _NANODET = Pixels(_IMAGENET.mean[::-1], _IMAGENET.std[::-1], "bgr")
@@ -56,7 +56,7 @@ class Network:
     @property
     def task(self) -> str | None:
         """That of Ultralytics."""
-        return task if (task := self.metadata.get("task")) in TASKS else None
+        return task if (task := self.metadata.get("task")) in DETECTOR_TASKS else None
 
 
 def form_of(network: Network, word: str | None = None) -> Form | None:
@@ -315,7 +315,7 @@ def _ultralytics(
     own, shape = network.task, ast.literal_eval(str(network.metadata.get("kpt_shape")))
     for classes in (network.classes, 0):
         forms = []
-        for task in (own,) if own else TASKS:
+        for task in (own,) if own else DETECTOR_TASKS:
             beside = {"obb": 1, "segment": masks}.get(task, 0)
             scores = (classes or (1 if task == "pose" else total - 4 - beside)) if last else 1
             columns = dict(boxes=4, scores=scores) | ({} if last else dict(labels=1))

@@ -13,6 +13,7 @@ from darswin.boxes.arrays import like, to_numpy
 from darswin.boxes.turned import as_turned
 from darswin.models.prepared import Prepared
 from darswin.utils.parameters import naming
+from darswin.utils.tasks import DETECTOR_TASKS
 from darswin.views import PixelView, Remap, View
 from darswin.views.remap import tensor_like
 
@@ -85,16 +86,18 @@ def decode_detections(
     tables = [of for of in outputs.values() if of.dim() == 3 and of.is_floating_point()]
     objects = [leaf for leaf in leaves if not isinstance(leaf, Tensor)]
     is_detector = any(hasattr(leaf, name) for leaf in objects for name in _OBJECTS)
-    if word == "numbers" or not (tables or is_detector or word or "task" in told):
+    is_detector |= told.get("task") in DETECTOR_TASKS
+    if word == "numbers" or not (tables or is_detector or word):
         return None
     from darswin.frames.forms import decode, grids  # need the compiled part of frames
-    from darswin.frames.recognise import TASKS, Network, form_of, names_of
+    from darswin.frames.recognise import Network, form_of, names_of
 
-    count, size = len(pictures), (pictures.shape[2], pictures.shape[3])
+    size = (pictures.shape[2], pictures.shape[3])
     sides = {side for table in tables for side in table.shape[1:]}
-    is_detector |= told.get("task") in TASKS or not sides.isdisjoint(grids(size))
+    is_detector |= not sides.isdisjoint(grids(size))
     if torch.compiler.is_compiling():  # values are not known, and detections are refused later
-        return [{}] * count if is_detector else None
+        return [{}] * len(pictures) if is_detector else None
+    count = len(pictures)
     quarter = (size[0] // 4, size[1] // 4)
     protos = [of for of in leaves if isinstance(of, Tensor) and of.shape[2:] == quarter]
     if len(protos) == 1 and all(of is not protos[0] for of in outputs.values()):
