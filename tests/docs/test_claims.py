@@ -247,7 +247,7 @@ def test_the_studies_of_wide_lenses_show_their_point():
         )
         assert abs(adapter) < 0.1 and absolute > 25 and polar < 1 and fixed > 10
     assert detected("tiles: 6", "of_flat") >= 1
-    assert max(map(detected, ("tiles: 4 of 256²", "tiles: 5 of 224²"))) < detected("raw")
+    assert max(map(detected, ("tiles: 4 of 256²", "tiles: 5 of 224²"))) < detected("mercator")
     ways = ("concentric square", "raw", "mercator", "tiles: 5")
     rising = [detected(of, table="NanoDet, level") for of in ways]
     assert rising == sorted(set(rising))
