@@ -54,6 +54,7 @@ def slices(network: OnnxNetwork, picture: np.ndarray, count: int) -> list[Instan
     for y in np.linspace(0, picture.shape[0] - height, count).round().astype(int):
         for x in np.linspace(0, picture.shape[1] - width, count).round().astype(int):
             part = seen_by(network, picture[y : y + height, x : x + width])
+            part = part.through(lambda xy: xy, (height, width), cut=(height, width))
             found.append(replace(part, boxes=part.boxes + np.array([x, y, x, y])))
     return found
 
@@ -70,7 +71,8 @@ def look(
     """What is found in one way: "raw", "slices:2" with the whole picture, or a view's name."""
     kind, _, count = way.partition(":")
     if kind in ("raw", "slices"):
-        parts = [seen_by(network, picture)]
+        whole = seen_by(network, picture).through(lambda xy: xy, picture.shape[:2])
+        parts = [whole.with_columns(cut=np.zeros(len(whole), bool))]
         parts += slices(network, picture, int(count)) if kind == "slices" else []
     else:
         options = {"count": int(count)} if count else {}
