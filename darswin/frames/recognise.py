@@ -147,8 +147,9 @@ def _are_whole(values: np.ndarray) -> bool:
 
 
 def _are_scores(values: np.ndarray) -> bool:
-    """Whether they are from 0 to 1, also if 16 bits round them."""
-    return values.min(initial=0) > -0.01 and values.max(initial=0) < 1.01
+    """Whether they are from 0 to 1, also if 16 bits round them; NaN and infinity are told later."""
+    finite = values[np.isfinite(values)]
+    return finite.min(initial=0) > -0.01 and finite.max(initial=0) < 1.01
 
 
 def _separate(network: Network) -> Candidates:

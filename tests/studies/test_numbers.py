@@ -56,7 +56,10 @@ def scene_of(rng, label: str) -> tuple[Detected, list[Thing]]:
     found = np.concatenate((truth + rng.normal(0, 12, truth.shape), truth[::-1] + 300))
     labels = np.full(len(found), COCO.index(label))
     labels[rng.integers(len(found))] = 0
-    return Detected(found, rng.uniform(0.1, 1, len(found)), labels, np.ones(len(found))), things
+    ones = np.ones(len(found))
+    return Detected(
+        found, rng.uniform(0.1, 1, len(found)), labels, ones, 0 * ones, 0 * ones
+    ), things
 
 
 def test_scenes_that_count_twice_are_two_scenes():
@@ -74,7 +77,9 @@ def test_scenes_that_count_twice_are_two_scenes():
 def test_each_thing_is_hit_once_and_only_by_its_class():
     box, (dog, cat) = np.array([10.0, 10, 50, 50]), map(COCO.index, ("dog", "cat"))
     things = [Thing("dog", "", np.array([0, 0, 1.0]), 0.3, box)]
-    found = Detected(np.stack([box] * 3), np.array([0.5, 0.9, 0.8]), np.array([dog, cat, dog]), 0)
+    found = Detected(
+        np.stack([box] * 3), np.array([0.5, 0.9, 0.8]), np.array([dog, cat, dog]), 0, 0, 0
+    )
     order, hits = match(found, things)
     assert order.tolist() == [1, 2, 0] and hits.tolist() == [-1, 0, -1]
     sure = rows_of([found._replace(scores=np.array([0.1, 0.2, 0.25]))], [things])
