@@ -147,7 +147,8 @@ class Fields:
         entries = self.of_kind(name, list, expected)
         if not all(isinstance(entry, Mapping) for entry in entries):
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(entries)}")
-        return [Fields(entry, f"{self.path(name)}[{i}].") for i, entry in enumerate(entries)]
+        where = self.path(name)
+        return [Fields(entry, f"{where}[{i}].") for i, entry in enumerate(entries)]
 
     def number(self, name: str, default: float | None = None, *expected: Any) -> float:
         """The entry as a finite number; `default`, if given, for a missing entry. `expected` are
