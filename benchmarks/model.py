@@ -94,7 +94,9 @@ def _measure(
     if mode == "inference":
         runs = candidates.inference(model, size, kind, batch, compiled=compiled)
     else:
-        runs = candidates.training(model, size, kind, batch)
+        runs = candidates.training(
+            model, size, kind, batch, compiled=compiled and dtype == "float32"
+        )
     _check(runs, TOLERANCES[dtype])
     least = LATENCY_RUNS if mode == "inference" and batch == 1 else TURNS
     wanted = targets.of_model(case) if threads == max(THREADS) else None

@@ -19,6 +19,8 @@
   "Tensor x, Tensor radii, Tensor? center, Tensor? affine, Tensor? points, Tensor? r_max, " \
   "int[] size"
 
+#define MLP "Tensor x, Tensor weight1, Tensor bias1, Tensor weight2, Tensor bias2"
+
 // A backward takes the arguments of its operator, then the gradient of the output.
 STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_sample(" SAMPLING ", bool tokens) -> Tensor");
@@ -36,6 +38,13 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_to_image_backward(" POLAR_TO_IMAGE
         ", bool tokens, Tensor? plan, Tensor grad_out, bool x_grad, bool lens_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
+  m.def("linear(Tensor x, Tensor weight, Tensor? bias) -> Tensor");
+  m.def(
+      "linear_backward(Tensor x, Tensor weight, Tensor? bias, Tensor grad_out, bool x_grad, "
+      "bool weight_grad, bool bias_grad) -> (Tensor, Tensor, Tensor)");
+  m.def("mlp(" MLP ") -> (Tensor, Tensor)");  // the second is kept for the backward
+  m.def("mlp_backward(" MLP
+        ", Tensor hidden, Tensor grad_out) -> (Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "_pack_linear(Tensor weight, Tensor? bias, Tensor? weight_scale=None, float scale=1.0, "
       "int zero_point=0) -> Tensor");
@@ -88,6 +97,8 @@ FACT int darswin_byte_products(int most) {
   if (most >= 0) darswin::limit_byte_products(static_cast<darswin::ByteProducts>(most));
   return static_cast<int>(darswin::byte_products());
 }
+
+FACT bool darswin_cpu_is_intel() { return darswin::cpu_is_intel(); }
 
 // Says whether calls of this thread use the threads of torch, as the backwards do by themselves.
 FACT void darswin_use_torch_threads(bool use) { darswin::TorchThreads::set(use); }

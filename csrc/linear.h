@@ -57,16 +57,19 @@ enum class After {
 //
 // Tokens lie in lines of `run` tokens, which begin `pitch` numbers apart. Floats may also lie in
 // `segments` pieces of the depth, which are `pitch` apart too: the neighbours of a pixel do. A
-// matrix of tokens is one line and one segment.
+// matrix of tokens is one line and one segment. A transposed matrix has a stride of 1, and a `step`
+// of more.
 template <typename X>
 struct LinearArgs {
   const X* x = nullptr;          // the first token; kSpare bytes of any value follow the last one
   const void* packed = nullptr;  // the layer
   int64_t rows = 0, depth = 0, columns = 0;
-  int64_t stride = depth, run = rows, pitch = 0, segments = 1;  // stride: from token to token
+  int64_t stride = depth, step = 1;  // from token to token, and from depth to depth of a float
+  int64_t run = rows, pitch = 0, segments = 1;
   float scale = 1;  // the size of a step of x, if it has 8 bits
   After after = After::nothing;
   float* out = nullptr;          // (rows, columns)
+  int64_t out_stride = columns;  // from row to row of `out`
   uint8_t* quantized = nullptr;  // the result as 8 bits, instead of `out`; not for After::add
   Quantizer quantizer = {};      // of `quantized`
 };
@@ -78,6 +81,12 @@ struct LinearKernels {
   Rows* rows;
   // The same with the CPU's products of four bytes, or with AMX; null on tiers without any.
   Rows *by_fours, *by_tiles;
+  // Writes panels [first, last) of a weight (columns, depth) behind the parameters at `packed`.
+  // This and the next are null for bytes.
+  void (*pack)(const float* weight, int64_t columns, int64_t depth, int64_t first, int64_t last,
+               float* packed);
+  // Writes a panel of a transposed weight, whose rows (depth, columns) are `pitch` apart.
+  void (*pack_rows)(const float* rows, int64_t pitch, int64_t depth, int64_t columns, float* panel);
 };
 
 }  // namespace darswin

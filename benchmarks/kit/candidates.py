@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+from unittest import mock
 
 import torch
 import torch.nn.functional as F
@@ -13,14 +14,14 @@ from torch import Tensor
 from darswin.deploy.optimize import optimize
 from darswin.deploy.own import own_linear
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend, onednn_lack
+from darswin.layers.linear import Linear
 from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
 from darswin.models.base import Model
 from darswin.models.pixel import PixelModel
 from darswin.models.registry import has_image_size, model_class
-from darswin.ops import use_reference
+from darswin.ops import linear, use_reference
 from kit import timing
 
 Run = Callable[[], Tensor]
@@ -128,7 +129,7 @@ def _libraries(layer: Any) -> dict[str, Callable[[Tensor], Tensor]]:
         "darswin": own_linear(layer),
         "torch": lambda x: F.linear(x, weight, bias),
     }
-    if onednn_lack() is None:
+    if torch.backends.mkldnn.is_available():
         # oneDNN keeps the weight in its own layout.
         packed = torch.ops.mkldnn._reorder_linear_weight(weight)
         product = torch.ops.mkldnn._linear_pointwise.default
@@ -159,27 +160,31 @@ def operations_of(name: str, size: int) -> int:
     return sum(2 * rows * layer.in_features * layer.out_features for layer, rows in products)
 
 
-def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, Run]:
+def training(
+    name: str, size: int, dtype: torch.dtype, batch: int, *, compiled: bool
+) -> dict[str, Run]:
     """The candidates for a training step, by name: forward, backward, AdamW; → the loss.
 
-    The matrix products alone are those of the linear layers with their backward. Our model uses the
-    library that computes them faster.
+    The matrix products alone are those of the linear layers with their backward, by our kernels or
+    by torch, whichever is faster.
     """
-    products = {b: training_products(name, size, dtype, batch, b) for b in MATMUL_BACKENDS}
-    backend = timing.fastest(products, turns=3)
-    return {
-        timing.OURS: training_step(name, size, dtype, batch, backend),
-        timing.REFERENCE: training_step(name, size, dtype, batch, None),
-        timing.MATMULS: products[backend],
+    products = {by: training_products(name, size, dtype, batch, by) for by in ("darswin", "torch")}
+    runs = {
+        timing.OURS: training_step(name, size, dtype, batch),
+        timing.REFERENCE: training_step(name, size, dtype, batch, is_reference=True),
+        timing.MATMULS: products[timing.fastest(products, turns=3)],
     }
+    if compiled:
+        torch._dynamo.reset()
+        runs[timing.COMPILED] = training_step(
+            name, size, dtype, batch, is_reference=True, compiled=True
+        )
+    return runs
 
 
-def training_products(
-    name: str, size: int, dtype: torch.dtype, batch: int, backend: MatmulBackend
-) -> Run:
+def training_products(name: str, size: int, dtype: torch.dtype, batch: int, by: str) -> Run:
     """The matrix products of a training step, forward and backward; → the last gradient."""
     model = network(name, size)
-    model.set_matmul_backend(backend)
     images = torch.randn(batch, 3, size, size)
     sides: list[tuple[Any, Tensor, list[Tensor], Tensor]] = []
     for layer, rows in products_of(model.eval(), images, lens_of(size)):
@@ -189,7 +194,8 @@ def training_products(
         sides.append((layer, x, wanted, torch.randn(rows, layer.out_features, dtype=dtype)))
 
     def run() -> Tensor:
-        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+        half = torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16)
+        with half, mock.patch.object(linear, "IS_FASTER", by == "darswin"):
             for layer, x, wanted, grad in sides:
                 found = torch.autograd.grad(layer(x), wanted, grad)
         return found[0]
@@ -198,23 +204,28 @@ def training_products(
 
 
 def training_step(
-    name: str, size: int, dtype: torch.dtype, batch: int, backend: MatmulBackend | None
+    name: str,
+    size: int,
+    dtype: torch.dtype,
+    batch: int,
+    *,
+    is_reference: bool = False,
+    compiled: bool = False,
 ) -> Run:
-    """A training step of our model, or, without a backend, of the reference; bfloat16 means
-    autocast."""
+    """A training step of our model or of the reference; bfloat16 means autocast."""
     model, lens = network(name, size).train(), lens_of(size)
-    if backend is not None:
-        model.set_matmul_backend(backend)
-        model.set_grad_checkpointing(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
     images = torch.randn(batch, 3, size, size)
     pixels = (size, size) if isinstance(model, PixelModel) else ()
     labels = torch.randint(model.num_classes, (batch, *pixels))
     half = dtype == torch.bfloat16
+    # So that it draws the same jitter.
+    options: Any = {"fallback_random": True}
+    run = torch.compile(model, options=options, dynamic=False) if compiled else model
 
     def step() -> Tensor:
-        with use_reference(backend is None), torch.autocast("cpu", torch.bfloat16, enabled=half):
-            loss = F.cross_entropy(model(images, lens).float(), labels)
+        with use_reference(is_reference), torch.autocast("cpu", torch.bfloat16, enabled=half):
+            loss = F.cross_entropy(run(images, lens).float(), labels)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

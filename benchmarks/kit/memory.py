@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 
-from darswin.layers.linear import MatmulBackend
 from darswin.utils.malloc import give_back_memory
 from kit import candidates
 from kit.timing import OURS, REFERENCE
@@ -80,8 +79,7 @@ def _measure_here(
     before = _resident("VmRSS")
     pixels, kind, reference = int(size), getattr(torch, dtype), name == REFERENCE
     if mode == "training":
-        backend: MatmulBackend | None = None if reference else "torch"
-        run = candidates.training_step(model, pixels, kind, int(batch), backend)
+        run = candidates.training_step(model, pixels, kind, int(batch), is_reference=reference)
     else:
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)

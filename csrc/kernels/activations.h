@@ -6,9 +6,9 @@
 namespace darswin {
 namespace {
 
-// Computes x Phi(x), where Phi is the normal distribution. 1 - Phi(|x|) equals e^(-x^2 / 2) times a
-// polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
-inline Floats gelu(Floats x) {
+// Returns 1 - Phi(|x|), where Phi is the normal distribution, from e^(-x^2 / 2). The quotient of
+// the two is a polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
+inline Floats normal_tail(Floats x, Floats exponential) {
   const Floats size = x < 0 ? -x : x;
   const Floats t = 1 / (1 + 0.35f * size);
   constexpr float terms[] = {-2.91455662e-2f, 1.43970054e-1f,  -2.55711114e-1f,
@@ -17,9 +17,19 @@ inline Floats gelu(Floats x) {
   Floats tail = splat<Floats>(terms[0]);
 #pragma GCC unroll 16
   for (std::size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
-  tail = tail * t * exponential_of_negative(size * size * -0.5f);
-  return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
+  return tail * t * exponential;
 }
+
+// A GELU, x Phi(x), and its derivative, Phi(x) + x Phi'(x).
+struct Gelu {
+  Floats value, derivative;
+};
+inline Gelu derived_gelu(Floats x) {
+  const Floats exponential = exponential_of_negative(x * x * -0.5f);
+  const Floats tail = normal_tail(x, exponential), phi = x < 0 ? tail : 1 - tail;
+  return {x * phi, phi + x * 0.3989422804f * exponential};  // the value is right at infinity, too
+}
+inline Floats gelu(Floats x) { return derived_gelu(x).value; }
 
 // NaN stays.
 inline Floats relu(Floats x) { return x < 0 ? Floats{} : x; }

@@ -8,17 +8,12 @@ namespace {
 
 constexpr int64_t kL = kLanes<float>;
 
-// Replaces each number by apply(register). The last registers overlap nothing: a short rest goes
-// through a register of its own.
+// Replaces each number by apply(register).
 template <typename Apply>
 void replace(float* x, int64_t n, Apply apply) {
   int64_t k = 0;
   for (; k + kL <= n; k += kL) store(x + k, apply(load<Floats>(x + k)));
-  if (k == n) return;
-  float rest[kL] = {};
-  for (int64_t e = k; e < n; ++e) rest[e - k] = x[e];
-  store(rest, apply(load<Floats>(rest)));
-  for (int64_t e = k; e < n; ++e) x[e] = rest[e - k];
+  if (k < n) store_first(x + k, apply(load_first(x + k, n - k)), n - k);
 }
 
 void add(const float* x, float* to, int64_t n) {
@@ -27,12 +22,37 @@ void add(const float* x, float* to, int64_t n) {
   for (; k < n; ++k) to[k] += x[k];
 }
 
+void add_rows(const float* x, int64_t rows, int64_t n, float* to) {
+  constexpr int64_t kRun = 32;  // rows whose sum is taken first, because long sums round more
+  for (int64_t c = 0; c < n; c += kL) {
+    const int64_t count = smaller(kL, n - c);
+    Floats all = load_first(to + c, count);
+    for (int64_t row = 0; row < rows; row += kRun) {
+      Floats run{};
+      for (int64_t k = row; k < smaller(row + kRun, rows); ++k) {
+        run += load_first(x + k * n + c, count);
+      }
+      all += run;
+    }
+    store_first(to + c, all, count);
+  }
+}
+
 void gelu_all(float* x, int64_t n) {
   replace(x, n, [](Floats v) { return gelu(v); });
 }
 
 void relu_all(float* x, int64_t n) {
   replace(x, n, [](Floats v) { return relu(v); });
+}
+
+void derive_gelu(float* x, float* grad, int64_t n) {
+  for (int64_t k = 0; k < n; k += kL) {
+    const int64_t count = smaller(kL, n - k);
+    const Gelu gelu = derived_gelu(load_first(x + k, count));
+    store_first(grad + k, load_first(grad + k, count) * gelu.derivative, count);
+    store_first(x + k, gelu.value, count);
+  }
 }
 
 void largest(const float* x, float* to, int64_t n) {
@@ -72,8 +92,10 @@ void mix(const float* const from[4], const float weights[4], float* to, int64_t 
 }  // namespace
 
 TIER_TABLE(ElementKernels) = {.add = add,
+                              .add_rows = add_rows,
                               .gelu = gelu_all,
                               .relu = relu_all,
+                              .derive_gelu = derive_gelu,
                               .largest = largest,
                               .distance = distance,
                               .mix = mix};

@@ -134,17 +134,18 @@ struct Panel {
     Sums* start;                          // (kPanel,): where the sums start, if not at zero
   };
 
-  // Computes kRows rows and kWide registers of columns. The rows of x are `stride` apart.
+  // Computes kRows rows and kWide registers of columns. The rows of x are `stride` apart, and the
+  // words of a row `step`.
   template <int kRows, int kWide>
-  [[gnu::noinline]] void tile(const Token* x, int64_t stride, const Part& part, int64_t row,
-                              int64_t n, Sums* so_far) const {
+  [[gnu::noinline]] void tile(const Token* x, int64_t stride, int64_t step, const Part& part,
+                              int64_t row, int64_t n, Sums* so_far) const {
     const Word* w = part.weight + n;
     Sums sum[kRows][kWide] = {};
     if constexpr (P::kStarts) {
       each_register<kRows, kWide>([&](int i, int v) { sum[i][v] = part.start[n / kL + v]; });
     }
     for (int64_t segment = 0; segment < part.segments; ++segment, x += a.pitch) {
-      for (int64_t k = 0; k < part.words; ++k, w += width) {
+      for (int64_t k = 0; k < part.words * step; k += step, w += width) {
         Weights weights[kWide];
         for (int v = 0; v < kWide; ++v) weights[v] = load<Weights>(w + v * kL);
         each_register<kRows, kWide>([&](int i, int v) {
@@ -172,7 +173,7 @@ struct Panel {
     Floats result[kRows][kWide];
     each_register<kRows, kWide>(
         [&](int i, int v) { result[i][v] = value(sum[i][v], first + n + v * kL); });
-    const int64_t left = a.columns - first - n, place = row * a.columns + first + n;
+    const int64_t left = a.columns - first - n, place = row * a.out_stride + first + n;
     if (a.after == After::relu) {
       each_register<kRows, kWide>([&](int i, int v) { result[i][v] = relu(result[i][v]); });
     }
@@ -182,12 +183,12 @@ struct Panel {
       finish<kRows, kWide>(copy, place, left);
     } else if (a.after == After::add) {
       each_register<kRows, kWide>([&](int i, int v) {
-        float* to = a.out + place + i * a.columns + v * kL;
+        float* to = a.out + place + i * a.out_stride + v * kL;
         store(to, load<Floats>(to) + result[i][v]);
       });
     } else {
       each_register<kRows, kWide>(
-          [&](int i, int v) { store(a.out + place + i * a.columns + v * kL, result[i][v]); });
+          [&](int i, int v) { store(a.out + place + i * a.out_stride + v * kL, result[i][v]); });
     }
   }
 
@@ -212,12 +213,12 @@ struct Panel {
                                 int64_t left) const {
     const Quantize quantize(a.quantizer);
     const After after = a.after;
-    const int64_t columns = a.columns;
+    const int64_t out_stride = a.out_stride;
     float* const out = a.out;
     uint8_t* const quantized = a.quantized;
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
-        const int64_t to = place + i * columns + v * kL;
+        const int64_t to = place + i * out_stride + v * kL;
         const int64_t count = left < v * kL ? 0 : smaller(kL, left - v * kL);
         const Floats result = after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
         if (quantized != nullptr && count < kL) {
@@ -261,17 +262,24 @@ struct Panel {
       for (int i = 0; i < kRows; ++i) {
         P::copy(token + i * a.stride, part.end - part.begin, copy + i * kPart);
       }
-      tiles<kRows>(copy, kPart, part, row, so_far);
+      tiles<kRows>(copy, kPart, 1, part, row, so_far);
+    } else if (a.step > 1) {  // a transposed matrix, whose rows may share few sets of the cache
+      X copy[kRows * kPart];
+      for (int64_t k = 0; k < part.words; ++k) {
+        for (int i = 0; i < kRows; ++i) copy[k * kRows + i] = token[k * a.step + i];
+      }
+      tiles<kRows>(copy, 1, kRows, part, row, so_far);
     } else {
-      tiles<kRows>(token, a.stride, part, row, so_far);
+      tiles<kRows>(token, a.stride, 1, part, row, so_far);
     }
   }
   template <int kRows>
-  void tiles(const Token* x, int64_t stride, const Part& part, int64_t row, Sums* so_far) const {
+  void tiles(const Token* x, int64_t stride, int64_t step, const Part& part, int64_t row,
+             Sums* so_far) const {
     int64_t n = 0;
-    for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(x, stride, part, row, n, so_far);
-    for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(x, stride, part, row, n, so_far);
-    for (; n < width; n += kL) tile<kRows, 1>(x, stride, part, row, n, so_far);
+    for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(x, stride, step, part, row, n, so_far);
+    for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(x, stride, step, part, row, n, so_far);
+    for (; n < width; n += kL) tile<kRows, 1>(x, stride, step, part, row, n, so_far);
   }
 
   void rows(int64_t first_row, int64_t last_row) const {
@@ -309,7 +317,7 @@ struct Panel {
       while (row < last_row) {
         const int64_t line = row / a.run, last = smaller((line + 1) * a.run, last_row);
         const X* const first = a.x + line * (a.pitch - a.run * a.stride) +
-                               begin / segment * a.pitch + begin % segment * kDepths<X>;
+                               begin / segment * a.pitch + begin % segment * kDepths<X> * a.step;
         for (; row + kTileRows <= last; row += kTileRows) {
           columns<kTileRows>(first + row * a.stride, part, row, so_far(row));
         }
@@ -354,6 +362,37 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
   if constexpr (P::kInTiles) P::Amx::release();
 }
 
+void pack(const float* weight, int64_t columns, int64_t depth, int64_t first, int64_t last,
+          float* packed) {
+  const int64_t padded = padded_columns(columns);
+  for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded); column += kL) {
+    const int64_t begin = column / kPanel * kPanel, width = smaller(kPanel, padded - begin);
+    float* to = packed + padded + begin * depth + column - begin;
+    const float* from = weight + column * depth;
+    int64_t k = 0;
+    for (; column + kL <= columns && k + kL <= depth; k += kL) {
+      Floats rows[kL];
+      for (int64_t i = 0; i < kL; ++i) rows[i] = load<Floats>(from + i * depth + k);
+      transpose_square(rows, to + k * width, width);
+    }
+    for (; k < depth; ++k) {
+      for (int64_t i = 0; i < kL; ++i) {
+        to[k * width + i] = column + i < columns ? from[i * depth + k] : 0;
+      }
+    }
+  }
+}
+
+void pack_rows(const float* rows, int64_t pitch, int64_t depth, int64_t columns, float* panel) {
+  const int64_t padded = padded_columns(columns);
+  for (int64_t k = 0; k < depth; ++k, rows += pitch, panel += padded) {
+    for (int64_t n = 0; n < padded; n += kL) {
+      const int64_t count = columns < n ? 0 : smaller(kL, columns - n);
+      store(panel + n, count == kL ? load<Floats>(rows + n) : load_first(rows + n, count));
+    }
+  }
+}
+
 template <typename P, bool kIsThere>
 constexpr auto if_there() -> decltype(&linear_rows<P>) {
   if constexpr (kIsThere) {
@@ -365,10 +404,15 @@ constexpr auto if_there() -> decltype(&linear_rows<P>) {
 
 }  // namespace
 
-TIER_TABLE(LinearKernels<float>) = {
-    .rows = linear_rows<Numbers>, .by_fours = nullptr, .by_tiles = nullptr};
+TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<Numbers>,
+                                    .by_fours = nullptr,
+                                    .by_tiles = nullptr,
+                                    .pack = pack,
+                                    .pack_rows = pack_rows};
 TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<Pairs>,
                                       .by_fours = if_there<Fours, kHasFours>(),
-                                      .by_tiles = if_there<Tiles, kHasTiles>()};
+                                      .by_tiles = if_there<Tiles, kHasTiles>(),
+                                      .pack = nullptr,
+                                      .pack_rows = nullptr};
 
 }  // namespace darswin

@@ -9,12 +9,11 @@ from typing import Any
 import torch
 
 from darswin.deploy.optimize import optimize
-from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import quantized_layers
 from darswin.models import create_model, list_models
 from darswin.models.registry import list_pretrained
 from darswin.models.saving import load_model, read_card
-from darswin.ops import _module, cpu_capability
+from darswin.ops import _module, cpu_capability, linear
 from darswin.utils import extras
 from darswin.utils.words import counted
 
@@ -60,7 +59,7 @@ def way_of(name: str) -> str:
 
 
 def facts() -> dict[str, str]:
-    """Versions, CPU, instruction-set tiers, threads, oneDNN, and which extras are installed."""
+    """Versions, CPU, instruction-set tiers, threads, products, and which extras are installed."""
     lack, checkout = _module.LACK, commit()
     compiler = f"compiled by {_module.build_info()['compiler']}"
     made = compiler if lack is None else "without its compiled module"
@@ -73,7 +72,7 @@ def facts() -> dict[str, str]:
     }
     if lack is not None:
         lines["tier"] = f"the PyTorch reference: {lack}"
-    lines["oneDNN"] = onednn_lack() or "in torch"
+    lines["training"] = f"linear layers by {'darswin' if linear.IS_FASTER else 'torch'}"
     if lack is None:
         lines["int8"] = f"darswin, {BYTE_PRODUCTS[_module.byte_products()]}"
     for extra in EXTRAS:

@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
@@ -24,10 +23,7 @@ def checkpointed(block: Any, x: Tensor, table: Tensor) -> Tensor:
     x = x + block.drop_path(y)
     y = block.norm2(x)
     with recomputed(y, block.norm2, x):
-        hidden = block.mlp.fc1(y)
-    y = F.gelu(hidden)
-    with recomputed(y, F.gelu, hidden):
-        y = block.mlp.fc2(y)
+        y = block.mlp(y)
     return x + block.drop_path(y)
 
 

@@ -8,7 +8,6 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.transformer import Block, Stage
 from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
@@ -66,7 +65,6 @@ class Model(nn.Module, Generic[Result]):
     reads_rays = False
     token_maps: Sequence[Pair] = ()
     refines_with_images = False
-    matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
     _looks = 3  # the number of calls that still look at the values of their images
 
     def __init__(self) -> None:
@@ -308,29 +306,11 @@ class Model(nn.Module, Generic[Result]):
         """Names of the parameters without weight decay, in addition to biases and norms."""
         return {name for name, _ in self.named_parameters() if ".position_bias." in name}
 
-    def set_matmul_backend(self, matmul_backend: MatmulBackend) -> None:
-        """Chooses the library that computes the matrix products of the linear layers.
-
-        Args:
-            matmul_backend: "torch" or "onednn", which applies to float32 on the CPU in eager mode.
-                The two round differently. Second derivatives need "torch".
-
-        Raises:
-            ValueError: the backend is unknown.
-        """
-        if matmul_backend not in MATMUL_BACKENDS:
-            raise ValueError(
-                f"matmul_backend must be one of {MATMUL_BACKENDS}, got {matmul_backend!r}"
-            )
-        for module in self.modules():
-            if isinstance(module, (Linear, Model)):
-                module.matmul_backend = matmul_backend
-
     def set_grad_checkpointing(self, enable: bool = True) -> None:
         """Turns on training with less memory, or turns it off.
 
-        The backward pass then recomputes the norms, the GELUs and the window attention, which are a
-        few percent of the work. The gradients stay the same, bit for bit.
+        The backward pass then recomputes the norms and the window attention, which are a few
+        percent of the work. The gradients stay the same, bit for bit.
         """
         for module in self.modules():
             if isinstance(module, Block):

@@ -138,13 +138,12 @@ class Encoder(Model[Tensor]):
     def reset_classifier(self, num_classes: int) -> None:
         """Replaces the head by a new one for `num_classes` classes, or by none for 0.
 
-        The new head has the dtype, the device and the matmul backend of the model.
+        The new head has the dtype and the device of the model.
         """
         self.num_classes = num_classes
         if num_classes:
             like = next(chain(self.norm.parameters(), self.parameters()))
             head = Linear(self.num_features, num_classes, device=like.device, dtype=like.dtype)
-            head.matmul_backend = self.matmul_backend
             init_weights(head)
             self.head = head.train(self.training)
         else:

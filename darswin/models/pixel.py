@@ -153,4 +153,3 @@ class PixelModel(Model[Tensor]):
             head = PixelHead(channels=num_classes, **options)
         head.apply(init_by_width)
         self.add_module(f"{self.task}_head", head.to(like).train(self.training))
-        self.set_matmul_backend(self.matmul_backend)

@@ -134,9 +134,10 @@ def register_gradients(name: str, groups: dict[int, int]) -> None:
     """Registers the autograd of an operator, and the fake of its backward.
 
     `groups` maps the index of each argument that has a gradient to its group, in the order of the
-    results of backward. The backward operator takes the operator's first arguments, the gradient
-    of the output, and a bool for each group: whether a gradient of this group is wanted. A
-    backward operator without these bools computes all gradients.
+    results of backward. The backward operator takes the operator's first arguments, what the
+    operator returned after its output, the gradient of the output, and a bool for each group:
+    whether a gradient of this group is wanted. A backward operator without these bools computes
+    all gradients.
     """
     if _module.LACK is not None:  # torch differentiates the reference
         return
@@ -145,11 +146,11 @@ def register_gradients(name: str, groups: dict[int, int]) -> None:
     taken = names.index("grad_out")
     bools = len(names) - taken - 1
 
-    def gradients(ctx, grad_out):
+    def gradients(ctx, grad_out, *_):
         tensors, needs = ctx.saved_tensors, ctx.needs_input_grad
         inputs = [o if t is None else t for t, o in zip(tensors, ctx.others, strict=True)]
         wanted = [any(needs[i] for i, of in groups.items() if of == k) for k in range(bools)]
-        results = [None] * len(inputs)
+        results = [None] * len(needs)
         found = backward(*inputs[:taken], grad_out, *wanted)
         for index, gradient in zip(groups, found, strict=True):
             if needs[index]:
@@ -165,13 +166,17 @@ def register_gradients(name: str, groups: dict[int, int]) -> None:
     def fake_backward(*arguments):
         return empty_gradients(arguments, groups, arguments[taken + 1 :])
 
-    _register_autograd(operator(name), f"darswin.{name}", gradients)
+    keeps = len(operator(name)._schema.returns) > 1
+    _register_autograd(operator(name), f"darswin.{name}", gradients, keeps)
     _register_autograd(backward, f"{name}'s backward", second_derivative)
     register_fake(f"{name}_backward")(fake_backward)
 
 
-def _register_autograd(operator: OpOverload, title: str, gradients: Callable) -> None:
-    """Makes autograd record the operator; `gradients(ctx, *grads)` is its derivative.
+def _register_autograd(
+    operator: OpOverload, title: str, gradients: Callable, keeps: bool = False
+) -> None:
+    """Makes autograd record the operator; `gradients(ctx, *grads)` is its derivative. If the
+    operator `keeps` all results but the first, they are for the derivative alone.
 
     The dispatcher calls `differentiable` in every mode: eager, compiled, exported and traced.
     torch.library.register_autograd would do the same, but it takes 10 to 40 µs more to record a
@@ -183,14 +188,19 @@ def _register_autograd(operator: OpOverload, title: str, gradients: Callable) ->
     use_torch_threads = _module.torch_threads_switch()
 
     def record(ctx, *arguments):
-        ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in arguments])
-        ctx.others = [None if isinstance(x, Tensor) else x for x in arguments]
         use_torch_threads(True)
         try:
             with torch._C._AutoDispatchBelowAutograd():
-                return operator(*arguments)
+                results = operator(*arguments)
         finally:
             use_torch_threads(False)
+        if keeps:
+            ctx.mark_non_differentiable(*results[1:])
+            ctx.set_materialize_grads(False)  # theirs would be as many zeros
+            arguments = (*arguments, *results[1:])
+        ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in arguments])
+        ctx.others = [None if isinstance(x, Tensor) else x for x in arguments]
+        return results
 
     methods = {"forward": staticmethod(record), "backward": staticmethod(gradients)}
     name = operator._schema.name.removeprefix("darswin::")

@@ -49,6 +49,7 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_cpu_is_intel.restype = ctypes.c_bool
     module.darswin_use_torch_threads.argtypes = [ctypes.c_bool]
     module.darswin_use_torch_threads.restype = None
     return module
@@ -95,6 +96,11 @@ def byte_products(most: str | None = None) -> str:
     """
     limit = -1 if most is None else BYTE_PRODUCTS.index(most)
     return BYTE_PRODUCTS[0 if _loaded is None else _loaded.darswin_byte_products(limit)]
+
+
+def is_fast_beside_mkl() -> bool:
+    """Whether our products in float32 are at least as fast as those of MKL."""
+    return cpu_capability() in ("avx2", "avx512") and not _loaded.darswin_cpu_is_intel()
 
 
 def torch_threads_switch() -> Callable[[bool], None]:

@@ -253,6 +253,11 @@ def on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -
     return torch.einsum("nij,nhwj->nhwi", inverse, points)
 
 
+def mlp(x: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+    """`darswin.ops.linear.mlp`."""
+    return F.linear(F.gelu(F.linear(x, weight1, bias1)), weight2, bias2)
+
+
 def window_attention(
     qkv: Tensor,
     bias: Tensor,

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
@@ -63,8 +62,6 @@ class TaskModule(LightningModule):
         weight_decay: the weight decay of AdamW.
         decay_position_bias: decays position biases too, as the authors' code does.
         reference_batch: images per step for which the learning rates are meant.
-        matmul_backend: the library for float32 matrix products: torch or onednn, which is twice as
-            fast on AMD CPUs. The choice changes how results are rounded.
         grad_checkpointing: saves a third of the memory for activations and costs a few percent of
             the time.
         seed: seeds the weights, the jitter, drop path and mixing.
@@ -93,7 +90,6 @@ class TaskModule(LightningModule):
         weight_decay: float = 0.05,
         decay_position_bias: bool = False,
         reference_batch: int = 512,
-        matmul_backend: MatmulBackend = "torch",
         grad_checkpointing: bool = False,
         seed: int = 0,
     ):
@@ -122,8 +118,7 @@ class TaskModule(LightningModule):
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
-        self.seed = seed
-        self.matmul_backend, self.grad_checkpointing = matmul_backend, grad_checkpointing
+        self.seed, self.grad_checkpointing = seed, grad_checkpointing
         self._steps_there: int | None = None  # steps per epoch of the run in the checkpoint
 
     # -- building -----------------------------------------------------------------------------
@@ -165,7 +160,6 @@ class TaskModule(LightningModule):
         if self.weights is not None and self.trainer.training:
             start_from(self.net, data.classes, self.weights)
         self._freeze()
-        self.net.set_matmul_backend(self.matmul_backend)
         self.net.set_grad_checkpointing(self.grad_checkpointing)
         self._make_metrics()
 

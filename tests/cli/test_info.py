@@ -12,7 +12,7 @@ import darswin
 from darswin.cli.info import EXTRAS, facts
 from darswin.cli.main import main
 from darswin.deploy.record import RULES
-from darswin.ops import _module, cpu_capability
+from darswin.ops import _module, cpu_capability, linear
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -41,13 +41,14 @@ def test_how_a_model_runs(model, way, capsys, monkeypatch):
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"model     {model}: {way}")
 
 
-def test_what_is_missing_and_why_onednn_is_not_used(monkeypatch):
+@pytest.mark.parametrize("ours", [False, True])
+def test_what_is_missing_and_who_multiplies(ours, monkeypatch):
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(EXTRAS) == declared["optional-dependencies"].keys()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    monkeypatch.setattr(linear, "IS_FASTER", ours)
     found = facts()
-    assert "is built without oneDNN" in found["oneDNN"]
+    assert found["training"] == f"linear layers by {'darswin' if ours else 'torch'}"
     for extra, packages in declared["optional-dependencies"].items():
         assert all(package.partition(">")[0] in found[f"[{extra}]"] for package in packages)
 

@@ -244,7 +244,6 @@ REFUSED = {
         r --model.options {"foo":1} => --model.options
         r --model.options {"embed_dim":1099511627776} => not enough memory: a smaller --data.batch
         r --model.name swin_unet_nano => swin_unet_nano is no model for --task classification
-        r --model.matmul_backend mkl => model.matmul_backend
         r --trainer.overfit_batches 2 => overfit_batches shuffles otherwise: take --data.limit
         r --trainer.max_epochs many => error: --trainer.max_epochs:
         r --trainer.max_epochs -1 => cosine needs an end: set --trainer.max_epochs or

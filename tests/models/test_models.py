@@ -21,7 +21,7 @@ from darswin.models.conv_unet import ConvUnet
 from darswin.models.encoder import Encoder
 from darswin.models.features import take_indices
 from darswin.models.registry import has_image_size, model_class
-from darswin.ops import use_reference
+from darswin.ops import linear, use_reference
 from darswin.views import make_view
 
 NAMES = list_models()
@@ -226,23 +226,22 @@ def test_a_batch_is_one_image_after_the_other_and_may_be_empty(case):
 
 
 @pytest.mark.parametrize(("name", "half"), product(NANOS, [False, True]))
-def test_a_training_step_repeats_with_a_seed_with_checkpointing_and_other_products(name, half):
+def test_a_training_step_repeats_with_a_seed_with_checkpointing_and_other_products(
+    name, half, monkeypatch
+):
     model, images, lenses = made(name, drop_path_rate=0.2)
     parameters, found = [*model.train().parameters()], {}
     # Under autocast all products are torch's.
-    for backend in ("torch",) if half else ("torch", "onednn"):
-        model.set_matmul_backend(backend)
+    for ours in (False,) if half else (False, True):
+        monkeypatch.setattr(linear, "IS_FASTER", ours)
         for enable in (False, False, True):
             model.set_grad_checkpointing(enable)
             torch.manual_seed(5)  # of jitter and drop path
             with torch.autocast("cpu", torch.bfloat16, enabled=half):
                 out = model(images, lenses)
             gradients = torch.autograd.grad(total(out), parameters)
-            assert_equal(gradients, found.setdefault(backend, gradients))
-    if half:
-        return
-    assert_gradients_close(model, found["onednn"], found["torch"])
-    refused(r"must be one of .*, got 'mkl'", model.set_matmul_backend, "mkl")
+            assert_equal(gradients, found.setdefault(ours, gradients))
+    assert_gradients_close(model, found[not half], found[False])
 
 
 @torch.no_grad()
@@ -487,12 +486,12 @@ def test_it_is_described_as_timm_describes_models(name):
 @nanos
 def test_a_new_head_is_of_the_models_kind(name):
     model, images, lenses = made(name)
-    model.bfloat16().set_matmul_backend("onednn")
+    model.bfloat16()
     for classes in (7, 3):
         model.reset_classifier(classes)
         head = model.get_submodule(model.pretrained_cfg["classifier"])
         assert head.out_features == model.num_classes == classes
-        assert head.matmul_backend == "onednn" and not head.training
+        assert not head.training
     assert {p.dtype for p in model.parameters()} == {torch.bfloat16}
     assert model(images.bfloat16(), lenses).shape[:2] == (2, 3)
     if name in NANO_UNETS:

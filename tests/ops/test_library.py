@@ -52,7 +52,8 @@ def test_every_compiled_operator_is_public_a_backward_or_private():
     no_operators = {"cpu_capability", "polar_to_image_plan", "use_reference"}
     public = set(ops.__all__) - no_operators
     assert public == set(CALLS)
-    assert {n for n in names if n[0] != "_"} == public | {f"{n}_backward" for n in public}
+    known = public | {"linear", "mlp"}  # of darswin.layers
+    assert {n for n in names if n[0] != "_"} == known | {f"{n}_backward" for n in known}
 
 
 @operators

@@ -195,7 +195,7 @@ MAY_CHANGE = {
     "": "checkpoint_steps weights_only",
     "model.": """learning_rate warmup_rate final_rate warmup_epochs reference_batch weight_decay
         label_smoothing mixup cutmix mix_p loss class_weights solid_angle_weights zones
-        matmul_backend grad_checkpointing""",
+        grad_checkpointing""",
     "data.": """path classes splits label_map skip_broken lens camera coefficients batch_size
         workers train_lenses test_lenses pair_lenses render fit picture_size randaugment erasing
         flip rotate_deg crop lens_augmentation test_paths max_distance""",
