@@ -161,7 +161,8 @@ GPU_PYTHON = PYTHONPATH=$(ROOT):$(ROOT)/$(GPU) PATH=$(ROOT)/$(GPU)/bin:$$PATH "$
 GPU_PACKAGES := cmake|matplotlib|ninja|numpy|opencv-python-headless|pybind11|pyyaml|safetensors|scikit-learn|setuptools|tqdm
 
 gpu:  ## check and time the operators, training and a model on a GPU, with the torch of PYTHON=python3 (9 minutes)
-	@"$(PYTHON)" -c 'import torch; torch.ones(1, device="$(DEVICE)")'
+	@"$(PYTHON)" -c 'import torch; torch.ones(1, device="$(DEVICE)")' 2>/dev/null || \
+	  { echo "the torch of $(PYTHON) cannot compute on $(DEVICE): give another Python, as PYTHON=…"; exit 1; }
 	@$(GPU_PYTHON) -c 'import cv2, matplotlib, numpy, pybind11, safetensors, sklearn, tqdm, yaml' 2>/dev/null || \
 	  "$(PYTHON)" -m pip install -q --upgrade --target $(GPU) $$(grep -E '^($(GPU_PACKAGES))==' requirements.txt) || true
 	@[ -e darswin/libdarswin.so ] || DARSWIN_BUILD=cmake-gpu $(GPU_PYTHON) setup.py -q build_ext --inplace || true
