@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-numerics test-all test-lowest test-isa sanitized test-asan test-tsan test-clang fuzz kills lint format bench study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-numerics test-all test-lowest test-isa sanitized test-asan test-tsan test-clang fuzz kills lint format bench gpu study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -152,6 +152,21 @@ bench: build  ## time the operators, training and a model against alternatives; 
 	$(BIN)/python benchmarks/frames.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python benchmarks/model.py --out benchmarks/results
+
+# With the torch of a Python of yours: that of .venv is for CPUs. Packages that it lacks come into
+# build/gpu; without a network or a compiler, the program says what it leaves out.
+GPU := build/gpu
+DEVICE := cuda
+GPU_PYTHON = PYTHONPATH=$(ROOT):$(ROOT)/$(GPU) PATH=$(ROOT)/$(GPU)/bin:$$PATH "$(PYTHON)"
+GPU_PACKAGES := cmake|matplotlib|ninja|numpy|opencv-python-headless|pybind11|pyyaml|safetensors|scikit-learn|setuptools|tqdm
+
+gpu:  ## check and time the operators, training and a model on a GPU, with the torch of PYTHON=python3 (9 minutes)
+	@"$(PYTHON)" -c 'import torch; torch.ones(1, device="$(DEVICE)")' 2>/dev/null || \
+	  { echo "the torch of $(PYTHON) cannot compute on $(DEVICE): give another Python, as PYTHON=…"; exit 1; }
+	@$(GPU_PYTHON) -c 'import cv2, matplotlib, numpy, pybind11, safetensors, sklearn, tqdm, yaml' 2>/dev/null || \
+	  "$(PYTHON)" -m pip install -q --upgrade --target $(GPU) $$(grep -E '^($(GPU_PACKAGES))==' requirements.txt) || true
+	@[ -e darswin/libdarswin.so ] || DARSWIN_BUILD=cmake-gpu $(GPU_PYTHON) setup.py -q build_ext --inplace || true
+	$(GPU_PYTHON) benchmarks/gpu.py --device $(DEVICE) --out benchmarks/results $(OPTIONS)
 
 study: build  ## run the paper's experiments on a small scale (one hour; can be interrupted)
 	$(BIN)/python studies/study.py

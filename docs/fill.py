@@ -163,6 +163,7 @@ def tables() -> dict[str, str]:
     single = peers.single_frames(one_frame.timings)
     demo = json.loads((ROOT / "docs" / "accuracy.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
+    gpus = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("gpu--*.json"))]
     quantized = json.loads((studies / "int8.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
     dense = json.loads((studies / "dense.json").read_text())
@@ -187,6 +188,7 @@ def tables() -> dict[str, str]:
         "paced": bench.paced_table(single),
         "from frame": bench.paced_table(t for t in one_frame.timings if t not in single),
         "starts": bench.starts_table(one_frame.starts),
+        "gpu": bench.gpu_text(gpus),
         "frames paced": bench.paced_table(frames.timings),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),

@@ -60,18 +60,30 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
     return torch.from_numpy(np.stack(images))[:, None], lenses
 
 
+def split() -> tuple[np.ndarray, Tensor, np.ndarray, np.ndarray]:
+    """The scans (N, 8, 8) in [0, 1], their labels, and the indices of those to train and test."""
+    digits = load_digits()
+    seen, unseen = train_test_split(
+        np.arange(len(digits.target)), test_size=500, random_state=0, stratify=digits.target
+    )
+    return (digits.images / 16).astype(np.float32), torch.from_numpy(digits.target), seen, unseen
+
+
 def train(
     model: Encoder, scans: np.ndarray, labels: Tensor, epochs: int, batch: int, seed: int, name: str
 ) -> None:
-    """Trains the model in place. Each epoch warps every image with a new lens of `LEVEL`."""
-    rng = np.random.default_rng(seed)
+    """Trains the model in place, on its device. Each epoch warps every image with a new lens of
+    `LEVEL`."""
+    rng, device = np.random.default_rng(seed), next(model.parameters()).device
+    labels = labels.to(device)
     steps = epochs * (len(scans) // batch)
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=0.05)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
     model.train()
     with tqdm(total=steps, desc=f"train {name}", unit="step") as progress:
         for _ in range(epochs):
-            images, lenses = through_lenses(scans, rng.uniform(*LEVELS[LEVEL], len(scans)))
+            xi = rng.uniform(*LEVELS[LEVEL], len(scans))
+            images, lenses = (x.to(device) for x in through_lenses(scans, xi))
             order = torch.from_numpy(rng.permutation(len(scans)))
             for index in order.split(batch)[: len(scans) // batch]:
                 loss = F.cross_entropy(
@@ -89,7 +101,8 @@ def train(
 @torch.inference_mode()
 def accuracy(model: Encoder, images: Tensor, lenses: lens.Lens, labels: Tensor) -> float:
     """The top-1 accuracy in percent."""
-    model.eval()
+    device = next(model.eval().parameters()).device
+    images, lenses, labels = (x.to(device) for x in (images, lenses, labels))
     right = sum(
         (model(images[k], lenses[k]).argmax(1) == labels[k]).sum().item()
         for k in torch.arange(len(images)).split(100)
@@ -138,12 +151,7 @@ def main() -> None:
     args = parser.parse_args()
     start = time.perf_counter()
 
-    digits = load_digits()
-    scans = (digits.images / 16).astype(np.float32)
-    labels = torch.from_numpy(digits.target)
-    seen, unseen = train_test_split(
-        np.arange(len(scans)), test_size=500, random_state=0, stratify=digits.target
-    )
+    scans, labels, seen, unseen = split()
     tests = {
         xi: through_lenses(scans[unseen], np.full(len(unseen), xi))
         for xi in tqdm(XI, desc="warp test images", unit="lens")
@@ -167,7 +175,7 @@ def main() -> None:
         print(name.ljust(24) + "".join(f"{value:7.1f}" for value in np.mean(rows, 0)))
     model_name, options = MODELS["DarSwin-A"]
     sampler = create_model(model_name, **options).view
-    three = unseen[digits.target[unseen] == 3][0]
+    three = unseen[labels[unseen] == 3][0]
     save_figure(draw(table, scans[three], sampler), args.out / "accuracy.png", colors=256)
     record = json.dumps(dict(xi=XI, accuracy=table), indent=1)
     replace_file(args.out / "accuracy.json", record)

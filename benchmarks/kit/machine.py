@@ -16,6 +16,7 @@ T = TypeVar("T")
 # The packages whose speed is measured or compared with; OpenCV has two.
 PACKAGES = (
     "torch", "numpy", "onnxruntime", "openvino", "opencv-python", "opencv-python-headless",
+    "darswin",
 )  # fmt: skip
 THREADS = sorted({1, torch.get_num_threads()})  # the numbers of threads to measure with
 
@@ -29,7 +30,6 @@ def machine() -> dict[str, str | int]:
         compiler=_module.build_info()["compiler"],
         python=platform.python_version(),
         **_versions(),
-        darswin=version("darswin"),
         commit=commit(),
     )
 

@@ -38,9 +38,8 @@ class Record:
 
     def publish(self, folder: Path, suite: str, draw: Callable[["Record", Path], None]) -> None:
         """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot; prints the names."""
-        cpu = f"{self.machine['cpu']} {self.machine['tier']}".lower()
-        cpu = re.sub(r"\b(family|model|processor|cpu)\b", " ", cpu)
-        path = folder / f"{suite}--{'-'.join(re.findall('[a-z0-9]+', cpu))}.json"
+        cpu = slug(f"{self.machine['cpu']} {self.machine['tier']}")
+        path = folder / f"{suite}--{cpu}.json"
         self.save(path)
         print(path)
         try:
@@ -48,6 +47,12 @@ class Record:
             print(path.with_suffix(".png"))
         except ImportError as error:
             print(f"no plot: {error}", file=sys.stderr)
+
+
+def slug(device: str) -> str:
+    """The name of a CPU or another device, for the names of files."""
+    words = re.findall("[a-z0-9]+", device.lower())
+    return "-".join(w for w in words if w not in ("family", "model", "processor", "cpu"))
 
 
 def _known(items: Iterable[tuple[str, object]]) -> dict[str, object]:

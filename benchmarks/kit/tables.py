@@ -121,6 +121,36 @@ def memory_table(memory: Sequence[Memory]) -> str:
     return markdown(["peak memory (MB)", OURS, REFERENCE, "ratio"], rows)
 
 
+def gpu_text(records: Sequence[dict]) -> str:
+    """Sentences and a table on each record of `benchmarks/gpu.py`, or a sentence if none exists."""
+    return "\n\n".join(map(_gpu_text, records)) or "No one has tried DarSwin itself on a GPU yet."
+
+
+def _gpu_text(record: dict) -> str:
+    head, states = record["machine"], [check["state"] for check in record["checks"]]
+    passed, failed = states.count("passed"), states.count("FAILED")
+    digits = (
+        f"{name}, {min(rates.values()):.1f} to {max(rates.values()):.1f} %"
+        for name, rates in record["accuracy"].items()
+    )
+    lines = [
+        f"On one device ({head['device']}, torch {head['torch'].split('+')[0]}), {passed} checks "
+        f"passed, {failed} failed and {len(states) - passed - failed} were left out.",
+        *(f"Failed: {c['part']}, {c['name']}." for c in record["checks"] if c["state"] == "FAILED"),
+    ]
+    if record["accuracy"]:
+        lines.append(f"Accuracy of the demo's networks, trained there: {'; '.join(digits)}.")
+    peaks = {(m["mode"], m["batch"], m["name"]): m["peak"] for m in record["memory"]}
+    cells = []
+    for t in (Timing(**row) for row in record["timings"]):
+        peak = peaks.get((f"{t.mode}, {t.setting}", t.batch, t.name))
+        memory = "" if peak is None else f", {peak / 2**20:.0f} MB"
+        row = f"`{t.subject}`, {t.setting}, batch {t.batch}, {t.mode}"
+        cells.append((row, t.name, f"{t.batch / t.median:.0f}{memory}"))
+    table = ["", pivot("images/s, peak memory", cells)] if cells else []
+    return "\n".join([*lines, *table])
+
+
 def roofline_lines(record: Record) -> list[str]:
     """Operations per second of the matrix products alone, and of the whole model."""
     ours = {t.label: t.median for t in record.timings if t.name == OURS}

@@ -53,7 +53,7 @@ class Case:
 
     def smooth(self) -> Tensor:
         """The mask for the inputs of this call."""
-        return self.mask(**{name: t.detach().double() for name, t in self.inputs.items()})
+        return self.mask(**{name: t.detach().cpu().double() for name, t in self.inputs.items()})
 
 
 # -- comparing results -----------------------------------------------------------------------------
@@ -110,9 +110,12 @@ def assert_same_bits_on_any_number_of_threads(
         torch.set_num_threads(before)
 
 
-def assert_accurate(make: Callable[[], Case], draws: int = 3) -> None:
-    """The accuracy rule: against the float64 reference, the error of the float32 operator is at
-    most twice the error of the float32 reference, for the output and for each gradient.
+def assert_accurate(
+    make: Callable[[], Case], draws: int = 3, device: torch.device | str = "cpu"
+) -> float:
+    """The accuracy rule: against the float64 reference, the error of the float32 operator on the
+    device is at most twice the error of the float32 reference on the CPU, for the output and for
+    each gradient. Returns the largest share of the allowed error.
 
     An error is the largest absolute difference over all draws of `make`, since a single small
     tensor has too few numbers to measure rounding. An error of up to four roundings of the largest
@@ -123,9 +126,9 @@ def assert_accurate(make: Callable[[], Case], draws: int = 3) -> None:
         case = make()
         oracle = results(case.to(f64), is_reference=True)
         baseline = results(case, is_reference=True)
-        ours = results(case)
+        ours = results(case.to(torch.device(device)))
         for name, exact in oracle.items():
-            got = ours[name]
+            got = ours[name].cpu()
             assert got.dtype == f32 and got.shape == exact.shape
             assert torch.equal(got.isnan(), exact.isnan()), f"{name} is NaN elsewhere"
             if exact.numel() == 0:
@@ -134,9 +137,12 @@ def assert_accurate(make: Callable[[], Case], draws: int = 3) -> None:
             row = [(got - exact).abs().max(), (baseline[name] - exact).abs().max(), rounding]
             before = errors.get(name, [0.0] * 3)
             errors[name] = [max(a, b.item()) for a, b in zip(before, row, strict=True)]
+    worst = 0.0
     for name, (error, base, rounding) in errors.items():
         allowed = max(2 * base, 4 * rounding)
         assert error <= allowed, f"{name}: error {error:.3g}, allowed {allowed:.3g}"
+        worst = max(worst, error / (allowed or 1))
+    return worst
 
 
 def assert_rounded_once(
@@ -431,6 +437,13 @@ for name, sizes in ATTENTION.items():
     CASES["window_attention", name] = functools.partial(attention, **sizes)
 for name, sizes in MAPS.items():
     CASES["polar_to_image", name] = functools.partial(polar_map, **sizes)
+
+
+def draws_for(case: tuple[str, str]) -> int:
+    """How many draws measure the rounding of a named case: more if it has few numbers. For 900 sums
+    of 576 products, the largest error in three draws varies by a third."""
+    return 30 if case[1].startswith("deep") else 10 if "general" in case[1] else 3
+
 
 # A small case of each operator with all its inputs, and one without the optional inputs.
 GRID = dict(size=(7, 8), rows=4, columns=6, samples=(2, 3))

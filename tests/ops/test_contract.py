@@ -13,6 +13,7 @@ from cases import (
     assert_rounded_once,
     assert_same_bits_on_any_number_of_threads,
     bf16,
+    draws_for,
     elsewhere,
     f32,
     f64,
@@ -44,10 +45,7 @@ def test_equals_the_reference_in_float64(case):
 @pytest.mark.unsanitized  # it calls what the next test calls
 @every_case
 def test_accuracy_rule(case):
-    # With few numbers, more draws are needed to measure rounding. For 900 sums of 576 products, the
-    # largest error in three draws varies by a third.
-    draws = 30 if case[1].startswith("deep") else 10 if "general" in case[1] else 3
-    assert_accurate(CASES[case], draws=draws)
+    assert_accurate(CASES[case], draws_for(case))
 
 
 @every_case
