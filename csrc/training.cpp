@@ -1,8 +1,10 @@
 // linear, mlp and their backward on CPU: the linear layers of models in training.
 //
 // The weights change in every step, so each call packs them, for the kernels of optimized models.
-// An MLP computes blocks of rows that stay in the second-level cache. For its backward it keeps the
-// input of the GELU, and nothing else that is as wide.
+// Long maps are computed in parts that stay in the third-level cache. For its backward an MLP keeps
+// the input of the GELU, and nothing else that is as wide.
+//
+// Torch's own operators come before and after, so all of these use its threads.
 #include <algorithm>
 #include <tuple>
 #include <utility>
@@ -15,10 +17,9 @@
 namespace darswin {
 namespace {
 
-constexpr double kPerMicrosecond = 5e4;         // multiply-adds
-constexpr int64_t kUnit = 16, kMostRows = 128;  // of a block of rows
-constexpr int64_t kChunk = 512;                 // rows of which a sum is taken at once
-constexpr int64_t kPart = 1 << 19;              // numbers that stay in the third-level cache
+constexpr double kPerMicrosecond = 5e4;  // multiply-adds
+constexpr int64_t kChunk = 512;          // rows of which a sum is taken at once
+constexpr int64_t kPart = 1 << 19;       // numbers that stay in the third-level cache
 
 // Checks for a float32 tensor on the CPU, and returns it contiguous.
 Tensor checked(const Tensor& tensor, const char* name) {
@@ -45,19 +46,19 @@ struct Weights {
   }
 
   // The layer, and without its bias the layer of the transposed weight.
-  Tensor packed(Threads threads) const {
+  Tensor packed() const {
     const Tensor layer = new_layer(depth, columns);
     auto* const to = mutable_pointer<float>(layer);
     if (bias) std::copy_n(pointer<float>(*bias), columns, to);
-    parallel_ranges(panel_count(columns), threads, [&](int64_t begin, int64_t end) {
+    parallel_ranges(panel_count(columns), pack_threads(), [&](int64_t begin, int64_t end) {
       kernels<LinearKernels<float>>().pack(pointer<float>(weight), columns, depth, begin, end, to);
     });
     return layer;
   }
-  Tensor transposed(Threads threads) const {
+  Tensor transposed() const {
     const Tensor layer = new_layer(columns, depth);
     auto* const to = mutable_pointer<float>(layer) + padded_columns(depth);
-    parallel_ranges(panel_count(depth), threads, [&](int64_t begin, int64_t end) {
+    parallel_ranges(panel_count(depth), pack_threads(), [&](int64_t begin, int64_t end) {
       for (int64_t n = begin * kPanel; n < std::min(end * kPanel, depth); n += kPanel) {
         kernels<LinearKernels<float>>().pack_rows(pointer<float>(weight) + n, depth, columns,
                                                   std::min(kPanel, depth - n), to + n * columns);
@@ -72,36 +73,22 @@ struct Weights {
     std::fill_n(mutable_pointer<float>(layer), padded_columns(columns), 0.0f);
     return layer;
   }
+  Threads pack_threads() const { return threads_for(static_cast<double>(depth) * columns / 1e3); }
 };
 
-// Multiplies some rows on this thread.
-void multiply_rows(const float* x, int64_t rows, int64_t depth, const Tensor& packed,
-                   int64_t columns, float* out, After after = After::nothing) {
-  const LinearArgs<float> args{.x = x,
-                               .packed = packed.const_data_ptr(),
-                               .rows = rows,
-                               .depth = depth,
-                               .columns = columns,
-                               .after = after,
-                               .out = out};
-  kernels<LinearKernels<float>>().rows(args, 0, rows, 0, panel_count(columns));
-}
-
-// Calls body(first, count, scratch) for blocks of rows; `scratch` has `floats` numbers for a row.
-template <typename Body>
-void for_blocks(int64_t rows, Threads threads, int64_t floats, Body body) {
-  const int64_t each = round_up(units(rows, 2 * threads.count), kUnit);
-  const int64_t block = std::min(each, kMostRows);
-  const auto run = [&](int64_t begin, int64_t end, void* scratch) {
-    for (int64_t first = begin * block; first < std::min(end * block, rows); first += block) {
-      body(first, std::min(block, rows - first), static_cast<float*>(scratch));
-    }
-  };
-  run_with_scratch(units(rows, block), threads, block * floats * sizeof(float), run);
+// out = x * the packed layer
+void multiply_by(const Tensor& packed, const float* x, int64_t rows, int64_t depth, int64_t columns,
+                 float* out) {
+  multiply(x, rows, Layer(packed.const_data_ptr(), depth, columns, false), out);
 }
 
 // The rows of a part whose numbers, so many in each row, stay in the third-level cache.
 int64_t rows_of_part(int64_t floats) { return round_up(units(kPart, floats), kChunk); }
+
+// Memory for the numbers of a part.
+Tensor part_of(int64_t rows, int64_t floats) {
+  return new_tensor(Sizes{std::min(rows, rows_of_part(floats)), floats}, ScalarType::Float);
+}
 
 // Calls body(first, count) for parts of the rows, whose numbers stay in the third-level cache.
 template <typename Body>
@@ -114,7 +101,7 @@ void for_parts(int64_t rows, int64_t floats, Body body) {
 // cut into groups, whose number does not depend on the threads, and the sums of the groups are
 // added in their order. A thread computes the columns of some panels for one group.
 void derive_layer(const float* x, const float* grad_out, int64_t rows, const Weights& layer,
-                  Threads threads, bool adds, float* grad_weight, float* grad_bias) {
+                  bool adds, float* grad_weight, float* grad_bias) {
   constexpr int64_t kItems = 16;
   const int64_t depth = layer.depth, columns = layer.columns, panels = panel_count(depth);
   const int64_t groups = std::min(units(kItems, panels), std::max<int64_t>(rows / kChunk, 1));
@@ -162,16 +149,13 @@ void derive_layer(const float* x, const float* grad_out, int64_t rows, const Wei
     }
   };
   const int64_t floats = kPanel + kChunk * kPanel;
+  const Threads threads = threads_for(static_cast<double>(rows) * size / kPerMicrosecond);
   run_with_scratch(panels * groups, threads, floats * sizeof(float), add_up);
   for (int64_t group = 1; group < groups; ++group) {
     const auto [weight, bias] = sums(group);
     elements.add(weight, grad_weight, size);
     if (grad_bias != nullptr) elements.add(bias, grad_bias, columns);
   }
-}
-
-Threads threads_of(int64_t rows, int64_t depth, int64_t columns) {
-  return threads_for(static_cast<double>(rows) * depth * columns / kPerMicrosecond);
 }
 
 // A gradient like a tensor, which is zero without rows, or none.
@@ -202,18 +186,13 @@ struct Tokens {
 };
 
 Tensor linear(Tensor x, Tensor weight, MaybeTensor bias) {
+  const TorchThreads in_training;
   const Tokens tokens(x, kLinear);
   const Weights layer(weight, bias, tokens.dim, kLinear);
-  const int64_t depth = layer.depth, columns = layer.columns;
-  const Tensor out = new_tensor(tokens.sizes(columns), ScalarType::Float);
-  if (out.numel() == 0) return out;
+  const Tensor out = new_tensor(tokens.sizes(layer.columns), ScalarType::Float);
   ask_for_large_pages(out);
-  const Threads threads = threads_of(tokens.rows, depth, columns);
-  const Tensor packed = layer.packed(threads);
-  for_blocks(tokens.rows, threads, 0, [&](int64_t first, int64_t rows, float*) {
-    multiply_rows(pointer<float>(tokens.x) + first * depth, rows, depth, packed, columns,
-                  mutable_pointer<float>(out) + first * columns);
-  });
+  multiply_by(layer.packed(), pointer<float>(tokens.x), tokens.rows, layer.depth, layer.columns,
+              mutable_pointer<float>(out));
   return out;
 }
 
@@ -228,20 +207,16 @@ std::tuple<Tensor, Tensor, Tensor> linear_backward(Tensor x, Tensor weight, Mayb
   const Tensor grad_x = new_gradient(x_grad, x, rows);
   const Tensor grad_weight = new_gradient(weight_grad || bias_grad, weight, rows);
   const Tensor grad_bias = new_gradient(bias_grad, bias, rows);
-  const Threads threads = threads_of(rows, depth, columns);
-  const MaybeTensor packed =
-      x_grad && rows > 0 ? MaybeTensor(layer.transposed(threads)) : MaybeTensor();
   ask_for_large_pages(grad_x);
+  const MaybeTensor back = x_grad ? MaybeTensor(layer.transposed()) : std::nullopt;
   for_parts(rows, depth + columns, [&](int64_t begin, int64_t count) {
     const auto* const grad = pointer<float>(grad_out) + begin * columns;
-    if (x_grad) {
-      for_blocks(count, threads, 0, [&](int64_t row, int64_t block, float*) {
-        multiply_rows(grad + row * columns, block, columns, *packed, depth,
-                      mutable_pointer<float>(grad_x) + (begin + row) * depth);
-      });
+    if (back) {
+      multiply_by(*back, grad, count, columns, depth,
+                  mutable_pointer<float>(grad_x) + begin * depth);
     }
     if (weight_grad || bias_grad) {
-      derive_layer(pointer<float>(tokens.x) + begin * depth, grad, count, layer, threads, begin > 0,
+      derive_layer(pointer<float>(tokens.x) + begin * depth, grad, count, layer, begin > 0,
                    mutable_pointer<float>(grad_weight),
                    grad_bias.numel() > 0 ? mutable_pointer<float>(grad_bias) : nullptr);
     }
@@ -253,25 +228,36 @@ std::tuple<Tensor, Tensor, Tensor> linear_backward(Tensor x, Tensor weight, Mayb
 
 constexpr char kMlp[] = "mlp";
 
+// Calls body(k, n) for ranges of `count` numbers that the GELU replaces.
+template <typename Body>
+void for_numbers(int64_t count, Body body) {
+  constexpr double kNumbersPerMicrosecond = 1500;
+  parallel_ranges(count, threads_for(static_cast<double>(count) / kNumbersPerMicrosecond),
+                  [&](int64_t begin, int64_t end) { body(begin, end - begin); });
+}
+
 std::tuple<Tensor, Tensor> mlp(Tensor x, Tensor weight1, Tensor bias1, Tensor weight2,
                                Tensor bias2) {
+  const TorchThreads in_training;
   const Tokens tokens(x, kMlp);
   const Weights first(weight1, bias1, tokens.dim, kMlp);
   const Weights second(weight2, bias2, first.columns, kMlp);
   const int64_t depth = first.depth, width = first.columns, columns = second.columns;
   const Tensor out = new_tensor(tokens.sizes(columns), ScalarType::Float);
   const Tensor hidden = new_tensor(tokens.sizes(width), ScalarType::Float);
-  if (out.numel() == 0) return {out, hidden};
   ask_for_large_pages(out), ask_for_large_pages(hidden);
-  const Threads threads = threads_of(tokens.rows, depth + columns, width);
-  const Tensor packed1 = first.packed(threads), packed2 = second.packed(threads);
-  for_blocks(tokens.rows, threads, width, [&](int64_t row, int64_t rows, float* activated) {
-    float* const h = mutable_pointer<float>(hidden) + row * width;
-    multiply_rows(pointer<float>(tokens.x) + row * depth, rows, depth, packed1, width, h);
-    std::copy_n(h, rows * width, activated);
-    kernels<ElementKernels>().gelu(activated, rows * width);
-    multiply_rows(activated, rows, width, packed2, columns,
-                  mutable_pointer<float>(out) + row * columns);
+  const Tensor packed1 = first.packed(), packed2 = second.packed();
+  const Tensor scratch = part_of(tokens.rows, width);
+  auto* const activated = mutable_pointer<float>(scratch);
+  for_parts(tokens.rows, width, [&](int64_t begin, int64_t count) {
+    float* const h = mutable_pointer<float>(hidden) + begin * width;
+    multiply_by(packed1, pointer<float>(tokens.x) + begin * depth, count, depth, width, h);
+    for_numbers(count * width, [&](int64_t k, int64_t n) {
+      std::copy_n(h + k, n, activated + k);
+      kernels<ElementKernels>().gelu(activated + k, n);
+    });
+    multiply_by(packed2, activated, count, width, columns,
+                mutable_pointer<float>(out) + begin * columns);
   });
   return {out, hidden};
 }
@@ -293,28 +279,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> mlp_backward(Tensor x, Tensor
   const Tensor grad_x = grads(x), grad_weight1 = grads(weight1), grad_bias1 = grads(bias1),
                grad_weight2 = grads(weight2), grad_bias2 = grads(bias2);
   ask_for_large_pages(grad_x);
-  const Threads threads = threads_of(rows, depth + columns, width);
-  const Tensor back1 = first.transposed(threads), back2 = second.transposed(threads);
-  const int64_t part = std::min(rows, rows_of_part(width));
-  const Tensor scratch = new_tensor(Sizes{2, part, width}, ScalarType::Float);
-  auto *const activated = mutable_pointer<float>(scratch), *const derived =
-                                                               activated + part * width;
+  const Tensor back1 = first.transposed(), back2 = second.transposed();
+  const Tensor scratch1 = part_of(rows, width), scratch2 = part_of(rows, width);
+  auto *const activated = mutable_pointer<float>(scratch1), *const derived =
+                                                                mutable_pointer<float>(scratch2);
   for_parts(rows, width, [&](int64_t begin, int64_t count) {
     const float* const h = pointer<float>(hidden) + begin * width;
     const float* const grad = pointer<float>(grad_out) + begin * columns;
-    float* const to = mutable_pointer<float>(grad_x) + begin * depth;
-    for_blocks(count, threads, 0, [&](int64_t row, int64_t block, float*) {
-      float *const a = activated + row * width, *const grad_h = derived + row * width;
-      multiply_rows(grad + row * columns, block, columns, back2, width, grad_h);
-      std::copy_n(h + row * width, block * width, a);
-      kernels<ElementKernels>().derive_gelu(a, grad_h, block * width);
-      multiply_rows(grad_h, block, width, back1, depth, to + row * depth);
+    multiply_by(back2, grad, count, columns, width, derived);
+    for_numbers(count * width, [&](int64_t k, int64_t n) {
+      std::copy_n(h + k, n, activated + k);
+      kernels<ElementKernels>().derive_gelu(activated + k, derived + k, n);
     });
-    derive_layer(activated, grad, count, second, threads, begin > 0,
-                 mutable_pointer<float>(grad_weight2), mutable_pointer<float>(grad_bias2));
-    derive_layer(pointer<float>(tokens.x) + begin * depth, derived, count, first, threads,
-                 begin > 0, mutable_pointer<float>(grad_weight1),
-                 mutable_pointer<float>(grad_bias1));
+    multiply_by(back1, derived, count, width, depth,
+                mutable_pointer<float>(grad_x) + begin * depth);
+    derive_layer(activated, grad, count, second, begin > 0, mutable_pointer<float>(grad_weight2),
+                 mutable_pointer<float>(grad_bias2));
+    derive_layer(pointer<float>(tokens.x) + begin * depth, derived, count, first, begin > 0,
+                 mutable_pointer<float>(grad_weight1), mutable_pointer<float>(grad_bias1));
   });
   return {grad_x, grad_weight1, grad_bias1, grad_weight2, grad_bias2};
 }

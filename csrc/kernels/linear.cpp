@@ -24,8 +24,9 @@ namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-constexpr int64_t kPart = 128;  // words of a token in a tile; this part of a panel has 24 KB
-constexpr int64_t kTile = 16;   // tokens and words of a tile of AMX
+constexpr int64_t kPart = 128;   // words of a token in a tile; this part of a panel has 24 KB
+constexpr int64_t kTurned = 16;  // tokens of a transposed matrix: a line of the cache
+constexpr int64_t kTile = 16;    // tokens and words of a tile of AMX
 constexpr int64_t kMostRows = 128, kBlockBytes = 3 << 17;  // of a block of tokens
 
 // The kinds of products. X is the type of a token's numbers, Word that of a word in a tile, and Sum
@@ -263,12 +264,6 @@ struct Panel {
         P::copy(token + i * a.stride, part.end - part.begin, copy + i * kPart);
       }
       tiles<kRows>(copy, kPart, 1, part, row, so_far);
-    } else if (a.step > 1) {  // a transposed matrix, whose rows may share few sets of the cache
-      X copy[kRows * kPart];
-      for (int64_t k = 0; k < part.words; ++k) {
-        for (int i = 0; i < kRows; ++i) copy[k * kRows + i] = token[k * a.step + i];
-      }
-      tiles<kRows>(copy, 1, kRows, part, row, so_far);
     } else {
       tiles<kRows>(token, a.stride, 1, part, row, so_far);
     }
@@ -280,6 +275,27 @@ struct Panel {
     for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(x, stride, step, part, row, n, so_far);
     for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(x, stride, step, part, row, n, so_far);
     for (; n < width; n += kL) tile<kRows, 1>(x, stride, step, part, row, n, so_far);
+  }
+
+  // The same for a few tokens of a transposed matrix. Their words lie far apart and may share few
+  // sets of the cache, so tiles read a copy of them.
+  void turned(const X* token, int64_t count, const Part& part, int64_t row, Sums* so_far) const {
+    using Line = Vector<X, kTurned>;
+    X copy[kTurned * kPart];
+    for (int64_t k = 0; k < part.words; ++k) {
+      const X* const from = token + k * a.step;
+      if (count == kTurned) {
+        store(copy + k * kTurned, load<Line>(from));
+      } else {
+        for (int64_t i = 0; i < count; ++i) copy[k * kTurned + i] = from[i];
+      }
+    }
+    int64_t i = 0;
+    const auto next = [&]<int kRows>() {
+      tiles<kRows>(copy + i, 1, kTurned, part, row + i, so_far + i * kPanel / kL);
+    };
+    for (; i + kTileRows <= count; i += kTileRows) next.template operator()<kTileRows>();
+    for (; i < count; ++i) next.template operator()<1>();
   }
 
   void rows(int64_t first_row, int64_t last_row) const {
@@ -318,6 +334,11 @@ struct Panel {
         const int64_t line = row / a.run, last = smaller((line + 1) * a.run, last_row);
         const X* const first = a.x + line * (a.pitch - a.run * a.stride) +
                                begin / segment * a.pitch + begin % segment * kDepths<X> * a.step;
+        if constexpr (is_same_v<Token, float>) {
+          for (; a.step > 1 && row < last; row += kTurned) {
+            turned(first + row * a.stride, smaller(kTurned, last - row), part, row, so_far(row));
+          }
+        }
         for (; row + kTileRows <= last; row += kTileRows) {
           columns<kTileRows>(first + row * a.stride, part, row, so_far(row));
         }

@@ -11,14 +11,14 @@ _LINEAR, _MLP = _library.operator("linear"), _library.operator("mlp")
 # MKL takes slower paths on CPUs that are not Intel's. Our kernels need AVX2 to be faster.
 IS_FASTER = torch.backends.mkl.is_available() and _module.is_fast_beside_mkl()
 # With fewer rows, packing the weight takes longer than the product gains.
-LEAST_ROWS = 64
+LEAST_ROWS = 128
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The linear layer of tokens.
 
     Our own kernels compute the products, forward and backward, where they are faster: in float32,
-    for 64 rows or more, where torch would use MKL on a CPU with AVX2 that is not Intel's. Elsewhere
+    for 128 rows or more, where torch would use MKL on a CPU with AVX2 that is not Intel's. Elsewhere
     torch computes them: also under autocast, in exported graphs, in compiled inference, and for
     derivatives other than backward().
 
