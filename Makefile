@@ -150,6 +150,7 @@ bench: build  ## time the operators, training and a model against alternatives; 
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/one_frame.py --out benchmarks/results
 	$(BIN)/python benchmarks/frames.py --out benchmarks/results
+	$(BIN)/python benchmarks/steps.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python benchmarks/model.py --out benchmarks/results
 

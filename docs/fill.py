@@ -121,6 +121,19 @@ def frames_table(timings: Sequence[Timing]) -> str:
     return bench.markdown(["frame → samples", "ours (µs)", *peers], rows)
 
 
+def steps_text(records: Sequence[Record]) -> str:
+    """A sentence on the machine of each record of `benchmarks/steps.py`, and its table."""
+    texts = []
+    for record in records:
+        head, table = record.machine, bench.steps_table(record)
+        assert not head["commit"].endswith("dirty")
+        texts.append(
+            f"On {head['cores']} cores of an {head['cpu']}, on the tier `{head['tier']}`, with "
+            f"the code of commit {head['commit']}:\n\n{table}"
+        )
+    return "\n\n".join(texts)
+
+
 def demo_table(record: dict) -> str:
     """A row a model, a column a lens: the mean of the seeds."""
     rows = [
@@ -189,6 +202,7 @@ def tables() -> dict[str, str]:
         "from frame": bench.paced_table(t for t in one_frame.timings if t not in single),
         "starts": bench.starts_table(one_frame.starts),
         "gpu": bench.gpu_text(gpus),
+        "steps": steps_text([Record.load(path) for path in sorted(RESULTS.glob("steps--*.json"))]),
         "frames paced": bench.paced_table(frames.timings),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),

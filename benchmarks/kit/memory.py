@@ -11,7 +11,7 @@ import torch
 
 from darswin.utils.malloc import give_back_memory
 from kit import candidates
-from kit.timing import OURS, REFERENCE
+from kit.timing import BY_TORCH, OURS, REFERENCE
 
 BENCHMARKS = Path(__file__).parents[1]
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -58,7 +58,7 @@ def available() -> bool:
 def measure(
     mode: str, model: str, size: int, dtype: str, batch: int, name: str, threads: int
 ) -> Memory:
-    """Measures `OURS` or `REFERENCE` in a new process."""
+    """Measures `OURS`, `REFERENCE` or, in training, `BY_TORCH` in a new process."""
     arguments = map(str, (mode, model, size, dtype, batch, name, threads))
     command = [sys.executable, "-m", "kit.memory", *arguments]
     done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True)
@@ -80,6 +80,7 @@ def _measure_here(
     pixels, kind, reference = int(size), getattr(torch, dtype), name == REFERENCE
     if mode == "training":
         run = candidates.training_step(model, pixels, kind, int(batch), is_reference=reference)
+        run = candidates.by_torch(run) if name == BY_TORCH else run
     else:
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)

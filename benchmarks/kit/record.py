@@ -36,12 +36,17 @@ class Record:
         content["starts"] = [Start(**row) for row in content.get("starts", ())]
         return cls(**content)
 
-    def publish(self, folder: Path, suite: str, draw: Callable[["Record", Path], None]) -> None:
-        """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot; prints the names."""
+    def publish(
+        self, folder: Path, suite: str, draw: Callable[["Record", Path], None] | None
+    ) -> None:
+        """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot if it has one; prints the
+        names."""
         cpu = slug(f"{self.machine['cpu']} {self.machine['tier']}")
         path = folder / f"{suite}--{cpu}.json"
         self.save(path)
         print(path)
+        if draw is None:
+            return
         try:
             draw(self, path.with_suffix(".png"))
             print(path.with_suffix(".png"))

@@ -7,9 +7,11 @@ from kit.memory import Memory, compared
 from kit.record import Record
 from kit.start import Start
 from kit.timing import (
+    BY_TORCH,
     COMPILED,
     COMPILED_BFLOAT16,
     FIXED_LENS,
+    FORWARD,
     MATMULS,
     OURS,
     OURS_FLOAT32,
@@ -119,6 +121,28 @@ def memory_table(memory: Sequence[Memory]) -> str:
     found = compared(memory)
     rows = [[what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"] for what, a, b in found]
     return markdown(["peak memory (MB)", OURS, REFERENCE, "ratio"], rows)
+
+
+def steps_table(record: Record) -> str:
+    """Training steps: our time, the others' times over it, and the peak memory of the batch itself
+    over that with torch's products; a row for each model and batch."""
+    peers = (BY_TORCH, REFERENCE, COMPILED)
+    own = {(m.mode, m.batch, m.name): m.own for m in record.memory}
+    rows = []
+    for name in dict.fromkeys(t.subject for t in record.timings):
+        for (_, batch, _), found in by_case(t for t in record.timings if t.subject == name).items():
+            peaks = [own.get((name, batch, kind), 0) for kind in (OURS, BY_TORCH)]
+            rows.append(
+                [
+                    f"`{name}`, batch {batch}",
+                    milliseconds(found[OURS], 0),
+                    *(ratios(found[peer], 2) for peer in peers),
+                    BOTH.join(f"{1 / t.ratio:.1f}" for t in found[FORWARD]),
+                    f"{peaks[0] / peaks[1]:.2f}" if all(peaks) else "",
+                ]
+            )
+    heads = ["step", "ours (ms)", *peers, "over optimized forwards", "memory"]
+    return markdown(heads, rows)
 
 
 def gpu_text(records: Sequence[dict]) -> str:

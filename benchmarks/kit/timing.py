@@ -14,6 +14,7 @@ import torch
 
 OURS, FIXED_LENS, REFERENCE = "darswin", "darswin, fixed lens", "reference"
 COMPILED, MATMULS = "compiled reference", "matrix products alone"
+BY_TORCH, FORWARD = "torch's products", "optimized forward"  # of a training step
 # A model with 8 bits is compared with others.
 OURS_FLOAT32 = f"{OURS}, float32"
 COMPILED_BFLOAT16 = f"{COMPILED}, bfloat16"

@@ -100,7 +100,8 @@ def byte_products(most: str | None = None) -> str:
 
 def is_fast_beside_mkl() -> bool:
     """Whether our products in float32 are at least as fast as those of MKL."""
-    return cpu_capability() in ("avx2", "avx512") and not _loaded.darswin_cpu_is_intel()
+    fast = cpu_capability() in ("avx2", "avx512")
+    return _loaded is not None and fast and not _loaded.darswin_cpu_is_intel()
 
 
 def torch_threads_switch() -> Callable[[bool], None]:

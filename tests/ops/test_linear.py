@@ -51,15 +51,15 @@ def case(name, rows, dim, width, scale=1.0):
 
 
 every_name = pytest.mark.parametrize("name", ["linear", "no bias", "mlp"])
-SMALL = dict(rows=(2, 40), dim=5, width=7)
+SMALL = dict(rows=(2, 70), dim=5, width=7)
 
 
 # One row of blocks and many, whole registers and rests, one part of the depth and several, one
 # group of rows and several, and parts of the rows of a long map.
 @every_name
 @pytest.mark.parametrize(("rows", "dim", "width"), [
-    ((64,), 1, 1), ((3, 5, 9), 33, 50), ((130,), 48, 96), ((1, 1100), 16, 49), ((70,), 300, 17),
-    ((2, 2100), 20, 260), ((90,), 129, 385),
+    ((128,), 1, 1), ((3, 5, 9), 33, 50), ((130,), 48, 96), ((1, 1100), 16, 49), ((170,), 300, 17),
+    ((2, 2100), 20, 260), ((190,), 129, 385),
 ])  # fmt: skip
 def test_accuracy_and_threads(name, rows, dim, width):
     assert_accurate(partial(case, name, rows, dim, width))
@@ -72,7 +72,7 @@ def test_accuracy_and_threads(name, rows, dim, width):
 
 @pytest.mark.parametrize("scale", [1e-30, 30.0])
 def test_accuracy_of_small_and_large_numbers(scale):
-    assert_accurate(lambda: case("mlp", (64,), 24, 32, scale))
+    assert_accurate(lambda: case("mlp", (128,), 24, 32, scale))
 
 
 @every_name
@@ -159,7 +159,7 @@ def test_compiled_training_has_our_products(name):
 def test_where_torch_multiplies(monkeypatch):
     monkeypatch.setattr(operators, "_LINEAR", None)
     monkeypatch.setattr(operators, "_MLP", None)
-    layers, x = Mlp(12, 20), torch.randn(64, 12)
+    layers, x = Mlp(12, 20), torch.randn(128, 12)
     layer = layers.fc1
     with pytest.raises(TypeError):
         layer(x)
@@ -167,9 +167,9 @@ def test_where_torch_multiplies(monkeypatch):
         assert layer(x).dtype == layers(x).dtype == torch.bfloat16
     double = copy.deepcopy(layer).double()
     assert double(x.double()).dtype == torch.float64
-    assert layer(x[:63]).shape == (63, 20) and layers(x[:0]).shape == (0, 12)
+    assert layer(x[:127]).shape == (127, 20) and layers(x[:0]).shape == (0, 12)
     torch.testing.assert_close(
-        grad(lambda x: layer(x).sum())(x), layer.weight.sum(0).expand(64, 12)
+        grad(lambda x: layer(x).sum())(x), layer.weight.sum(0).expand(128, 12)
     )
     torch.testing.assert_close(torch.func.jvp(layer, (x,), (x,))[1], x @ layer.weight.T)
     graph = torch.export.export(layers, (x,)).graph
@@ -179,12 +179,12 @@ def test_where_torch_multiplies(monkeypatch):
 
 
 def test_what_an_mlp_keeps_and_who_watches_it():
-    layers, x = Mlp(12, 48), torch.randn(2, 40, 12)
+    layers, x = Mlp(12, 48), torch.randn(2, 70, 12)
     saved = []
     with torch.autograd.graph.saved_tensors_hooks(lambda t: saved.append(t) or t, lambda t: t):
         layers(x).sum().backward()
     kept = sum(t.numel() for t in saved if t.dim() == 3)
-    assert kept == 80 * (12 + 48)  # x, and the input of the GELU
+    assert kept == 140 * (12 + 48)  # x, and the input of the GELU
     seen = []
     layers.fc2.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     layers(x)
