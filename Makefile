@@ -32,7 +32,7 @@ PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocess
 
 # The tests of what is compiled, which other compilers and sanitizers run too, and among them those of
 # the kernels, which differ from tier to tier.
-KERNELS := $(addprefix $(ROOT)/tests/,$(foreach name,blocks contract gathers polar_sample \
+KERNELS := $(addprefix $(ROOT)/tests/,$(foreach name,blocks contract gathers linear polar_sample \
   polar_to_image properties quantized_blocks window_attention,ops/test_$(name).py) \
   frames/test_plans.py deploy/test_contract.py)
 COMPILED := $(addprefix $(ROOT)/tests/,ops frames deploy/test_contract.py deploy/test_record.py)
