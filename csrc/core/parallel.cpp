@@ -2,8 +2,8 @@
 //
 // A call publishes a job, whose work is cut into chunks. The calling thread takes chunk after
 // chunk, and so do helpers that are awake. When no chunk is left, the call only waits for chunks
-// that helpers have begun. A helper without work stays awake for some microseconds, because the
-// next job of a network follows at once, and then it sleeps. A call wakes at most one helper, on
+// that helpers have begun. A helper without work stays awake for a while, because the next job of a
+// network follows at once, and then it sleeps. A call wakes at most one helper, on
 // another core, and only for enough work; this helper wakes the next one.
 #include "parallel.h"
 
@@ -34,7 +34,7 @@ using Microseconds = std::chrono::duration<double, std::micro>;
 constexpr double kChunks = 4, kChunkTime = 200;  // at most; at least, in microseconds
 constexpr int64_t kMostHelpers = 1023, kSlices = 64;
 constexpr int kJobs = 16;  // of several callers at once; further calls work alone
-constexpr double kWorthWaking = 100, kAwake = 100;  // microseconds of work, and without work
+constexpr double kWorthWaking = 100, kAwake = 150;  // microseconds of work, and without work
 
 // The end of the first k of so many contiguous parts of [0, count).
 int64_t share(int64_t count, int64_t parts, int64_t k) {
@@ -181,7 +181,8 @@ bool help_any(int64_t helper) {
   return false;
 }
 
-// Stays awake until a new job comes, but not for long, and returns whether one came.
+// Stays awake until a new job comes, for as long as Python needs to call the next operator of a
+// frame, and returns whether one came.
 bool is_job_soon(uint32_t seen) {
   const auto begin = Clock::now();
   while (pool.epoch.load(std::memory_order_relaxed) == seen) {
