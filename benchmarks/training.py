@@ -1,17 +1,22 @@
 """Images per second in training and testing, and the share of time outside the model.
 
 Runs `Classification` and `WideAngleData` like `darswin fit`, on a folder of JPEG files, for each of
-the five models: with our operators and with their PyTorch reference. Then it measures the loader.
+the four models: with our operators and with their PyTorch reference. Before and after each training
+it times bare steps: forward, backward and AdamW, on images that are there. It also measures the
+loader.
 """
 
 import argparse
 import tempfile
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
+from kit.candidates import training_step
 from kit.machine import machine, num_threads
 from kit.record import write
 from lightning.pytorch import Callback, Trainer
@@ -20,13 +25,16 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from darswin.data.augment import RandAugment, RandomErasing
+from darswin.data.order import TrainingOrder
 from darswin.data.samples import Draw
 from darswin.ops import use_reference
 from darswin.train.classification import Classification
 from darswin.train.data import WideAngleData
+from darswin.utils.malloc import keep_freed_memory
 
 FAMILIES = ("darswin_a", "darswin_ra", "swin", "dat")
 WARM_UP = 3  # steps before the measurement
+IMAGE_SIZE = 64  # px, of all models
 
 
 def write_pictures(root: Path, count: int) -> None:
@@ -81,6 +89,17 @@ def run(mode: str, name: str, data: dict, steps: int, reference: bool) -> dict[s
     return watch.result(data["batch_size"])
 
 
+def bare_rate(name: str, batch: int, steps: int, reference: bool) -> float:
+    """Images per second of training steps alone."""
+    step = training_step(name, IMAGE_SIZE, torch.float32, batch, is_reference=reference)
+    for _ in range(WARM_UP):
+        step()
+    start = time.perf_counter()
+    for _ in range(steps):
+        step()
+    return steps * batch / (time.perf_counter() - start)
+
+
 def loader_rates(data: dict) -> dict[str, float]:
     """Images per second of the loader on one core: in total, and for each part of the work."""
     module = WideAngleData(**data)
@@ -103,7 +122,8 @@ def loader_rates(data: dict) -> dict[str, float]:
             rates[part] = count / (time.perf_counter() - start)
     cv2.setNumThreads(cv_threads)
     for workers in (1, 2):
-        batches = DataLoader(dataset, 16, num_workers=workers, prefetch_factor=4)
+        order = TrainingOrder(len(dataset), 16, rank=0, world=1)
+        batches = DataLoader(dataset, 16, sampler=order, num_workers=workers, prefetch_factor=4)
         iterator = iter(batches)
         next(iterator)
         start, count = time.perf_counter(), sum(len(b[0]) for b in iterator)
@@ -115,11 +135,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", default="micro", help="of the models")
     parser.add_argument("--batch", type=int, default=32)
-    parser.add_argument("--steps", type=int, default=12, help="timed, of each run")
+    parser.add_argument("--steps", type=int, default=24, help="timed, of each run")
     parser.add_argument("--quick", action="store_true", help="one model, few steps")
     parser.add_argument("--out", type=Path, help="folder of the record")
     args = parser.parse_args()
     warnings.filterwarnings("ignore")
+    keep_freed_memory()  # as `darswin fit` does
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()))
     families = FAMILIES[:1] if args.quick else FAMILIES
@@ -136,7 +157,11 @@ def main() -> None:
             name = f"{family}_{args.size}"
             # Half of the folder is enough for testing.
             given = dict(data, holdout=0.49 if mode == "test" else 0.1)
+            alone = partial(bare_rate, name, args.batch, steps - WARM_UP, bool(reference))
+            before = alone() if mode == "train" else 0.0
             found = run(mode, name, given, steps, bool(reference))
+            if mode == "train":
+                found["bare_images_per_second"] = (before + alone()) / 2
             entry = models.setdefault(name, {}).setdefault(mode, {})
             entry["reference" if reference else "darswin"] = found
     print(training_table(models))

@@ -2,14 +2,15 @@
 //
 // A call publishes a job, whose work is cut into chunks. The calling thread takes chunk after
 // chunk, and so do helpers that are awake. When no chunk is left, the call only waits for chunks
-// that helpers have begun. A helper without work stays awake for some microseconds, because the
-// next job of a network follows at once, and then it sleeps. A call wakes at most one helper, and
-// only for enough work; this helper wakes the next one.
+// that helpers have begun. A helper without work stays awake for a while, because the next job of a
+// network follows at once, and then it sleeps. A call wakes at most one helper, on
+// another core, and only for enough work; this helper wakes the next one.
 #include "parallel.h"
 
 #include <pthread.h>
 #if defined(__linux__)
 #  include <linux/futex.h>
+#  include <sched.h>
 #  include <sys/syscall.h>
 #  include <unistd.h>
 #endif
@@ -33,8 +34,7 @@ using Microseconds = std::chrono::duration<double, std::micro>;
 constexpr double kChunks = 4, kChunkTime = 200;  // at most; at least, in microseconds
 constexpr int64_t kMostHelpers = 1023, kSlices = 64;
 constexpr int kJobs = 16;  // of several callers at once; further calls work alone
-constexpr Microseconds kLeastAwake{6}, kMostAwake{100};
-constexpr double kWorthWaking = 100;  // microseconds of work
+constexpr double kWorthWaking = 100, kAwake = 150;  // microseconds of work, and without work
 
 // The end of the first k of so many contiguous parts of [0, count).
 int64_t share(int64_t count, int64_t parts, int64_t k) {
@@ -89,12 +89,18 @@ struct alignas(64) Job {
   }
 };
 
+struct Helper {
+  std::atomic<uint32_t> asleep{0};  // 1 until this helper is taken, to be woken
+  int thread = 0;                   // its number in the system
+};
+
 // Helpers use it until the process ends, so it has no destructor.
 struct Pool {
   Job jobs[kJobs];
-  alignas(64) std::atomic<uint32_t> epoch{0};             // counts published jobs
-  alignas(64) std::atomic<uint32_t> asleep{0}, woken{0};  // helpers; woken ones sleep a bit longer
-  std::atomic<int64_t> helpers{0}, seats{0};              // threads, and seats of all jobs
+  alignas(64) std::atomic<uint32_t> epoch{0};  // counts published jobs
+  alignas(64) std::atomic<int64_t> asleep{0};  // helpers, at least
+  std::atomic<int64_t> helpers{0}, seats{0};   // threads, and seats of all jobs
+  Helper helper[kMostHelpers];
   std::atomic<bool> growing{false};
 
   bool needs_helpers() const { return helpers - asleep < seats; }
@@ -123,33 +129,45 @@ void futex(std::atomic<uint32_t>& word, int operation, uint32_t value) {
   static_assert(sizeof(word) == sizeof(uint32_t));
   syscall(SYS_futex, &word, operation | FUTEX_PRIVATE_FLAG, value, nullptr, nullptr, 0);
 }
+int this_thread() { return static_cast<int>(syscall(SYS_gettid)); }
 // May also return without a reason.
 void wait_while(std::atomic<uint32_t>& word, uint32_t value) { futex(word, FUTEX_WAIT, value); }
-void notify_one(std::atomic<uint32_t>& word) { futex(word, FUTEX_WAKE, 1); }
+// Wakes a helper on another core than this one, and of those that this thread may use. Linux may
+// choose this one although others are idle: in a virtual machine, a core that sleeps looks as if
+// the host used it. The helper would interrupt this thread, or wait for milliseconds.
+void wake(Helper& helper) {
+  cpu_set_t all{};
+  sched_getaffinity(0, sizeof(all), &all);
+  cpu_set_t others = all;
+  CPU_CLR(sched_getcpu(), &others);
+  const bool limited = sched_setaffinity(helper.thread, sizeof(others), &others) == 0;
+  futex(helper.asleep, FUTEX_WAKE, 1);
+  if (limited) sched_setaffinity(helper.thread, sizeof(all), &all);
+}
 #else
+int this_thread() { return 0; }
 void wait_while(std::atomic<uint32_t>& word, uint32_t value) { word.wait(value); }
-void notify_one(std::atomic<uint32_t>& word) { word.notify_one(); }
+void wake(Helper& helper) { helper.asleep.notify_one(); }
 #endif
 
-bool take_one(std::atomic<uint32_t>& number) {
-  uint32_t old = number;
-  while (old > 0) {
-    if (number.compare_exchange_weak(old, old - 1)) return true;
-  }
-  return false;
+bool take(Helper& helper) {
+  if (helper.asleep == 0 || helper.asleep.exchange(0) == 0) return false;
+  --pool.asleep;
+  return true;
 }
 
 // Sleeps until somebody wakes this helper, or not at all if the epoch is no longer the one seen.
-void sleep(uint32_t seen) {
+void sleep(Helper& helper, uint32_t seen) {
   ++pool.asleep;
-  if (pool.epoch != seen && take_one(pool.asleep)) return;
-  while (!take_one(pool.woken)) wait_while(pool.woken, 0);
+  helper.asleep = 1;
+  if (pool.epoch != seen && take(helper)) return;
+  while (helper.asleep != 0) wait_while(helper.asleep, 1);
 }
 
 void wake_if_needed() {
-  if (!pool.needs_helpers() || !take_one(pool.asleep)) return;
-  ++pool.woken;
-  notify_one(pool.woken);
+  for (int64_t k = 0; k < pool.helpers && pool.needs_helpers(); ++k) {
+    if (take(pool.helper[k])) return wake(pool.helper[k]);
+  }
 }
 
 bool help_any(int64_t helper) {
@@ -163,28 +181,22 @@ bool help_any(int64_t helper) {
   return false;
 }
 
-// Waits for a new job, and returns whether one came.
-bool stay_awake(uint32_t seen, Microseconds time) {
+// Stays awake until a new job comes, for as long as Python needs to call the next operator of a
+// frame, and returns whether one came.
+bool is_job_soon(uint32_t seen) {
   const auto begin = Clock::now();
   while (pool.epoch.load(std::memory_order_relaxed) == seen) {
-    if (Clock::now() - begin > time) return false;
+    if (Microseconds(Clock::now() - begin).count() > kAwake) return false;
     for (int k = 0; k < 16; ++k) pause();
   }
   return true;
 }
 
-// What a helper does. Where it waits in vain, such as between the operators of torch, whose own
-// threads need the core, it soon goes to sleep.
 void help(int64_t helper) {
-  for (Microseconds awake = kMostAwake;;) {
+  pool.helper[helper - 1].thread = this_thread();
+  for (;;) {
     const uint32_t seen = pool.epoch;
-    if (help_any(helper)) continue;
-    if (stay_awake(seen, awake)) {
-      awake = std::min(2 * awake, kMostAwake);
-    } else {
-      awake = std::max(awake / 2, kLeastAwake);
-      sleep(seen);
-    }
+    if (!help_any(helper) && !is_job_soon(seen)) sleep(pool.helper[helper - 1], seen);
   }
 }
 
@@ -204,8 +216,8 @@ void grow(int64_t asked) {
   pool.growing.store(false, std::memory_order_release);
 }
 
-// To wake a helper takes this thread several microseconds, and the helper comes after tens. So it
-// is only woken if helpers would have had work for half of the recent time.
+// To wake a helper takes this thread tens of microseconds, and the helper comes after up to 150. So
+// it is only woken if helpers would have had work for half of the recent time.
 bool is_worth_waking(double microseconds) {
   thread_local double work = 0;
   thread_local Clock::time_point before{};

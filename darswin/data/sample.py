@@ -7,6 +7,7 @@ import numpy as np
 from darswin.data.labels.labels import Labels, moved
 from darswin.lens import Lens
 from darswin.views import PixelView
+from darswin.views.remap import Remap
 
 
 class Sample(NamedTuple):
@@ -24,7 +25,10 @@ class Sample(NamedTuple):
     def through(self, view: PixelView) -> Self:
         """The sample as a view of a camera shows it, a `CameraView` or a `CropView`; a class stays
         as it is, and `Labels` follow as `moved` says."""
-        remap = view.at(self.lens, (self.image.shape[0], self.image.shape[1]))
+        return self.moved(view.at(self.lens, (self.image.shape[0], self.image.shape[1])))
+
+    def moved(self, remap: Remap) -> Self:
+        """`through` the view of a map for pictures of this lens and size."""
         target = self.target
         if isinstance(target, np.ndarray):
             target = remap.target(target)

@@ -124,6 +124,13 @@ class Samples(Dataset):
         label: Any = as_tensor(target) if isinstance(target, np.ndarray) else target
         return torch.from_numpy(np.ascontiguousarray(image)), lens, label
 
+    def __getitems__(self, draws: Sequence[Draw | int]) -> list:
+        """The samples of a batch. Those with the same lens are made one after the other, because
+        they share its map too."""
+        order = sorted(range(len(draws)), key=lambda k: getattr(draws[k], "lens", k))
+        made = {k: self[draws[k]] for k in order}
+        return [made[k] for k in range(len(draws))]
+
     def headers(self, index: int) -> Sequence[Header]:
         """The headers of a picture's files; none for pictures in memory."""
         file = self.source.file(index)

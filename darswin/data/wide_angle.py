@@ -16,6 +16,7 @@ from darswin.utils.angles import degrees_hint
 from darswin.utils.resize import area_resized
 from darswin.utils.tasks import Fit
 from darswin.views import CameraView, CropView
+from darswin.views.remap import Remap
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
@@ -66,15 +67,18 @@ class WideAngle(Samples):
         super().__init__(source, size=size, fit=fit, **options)
         self.lenses, self.fov = lenses, fov
         self.render, self.picture_size = render, picture_size
+        self._last: tuple[Any, Remap] | None = None  # the map of the last sample, and its key
 
     def _read(self, draw: Draw) -> Sample:
         picture, label = self.source[draw.picture]
         picture = self._square(picture)
         sample = Sample(picture, label, _view(self.fov, len(picture)))
-        # A turn leaves the lens as it is, which is round and in the middle.
-        return sample.through(
-            CameraView(self._lens_alone(draw), turn=self._turn(draw), supersampling=1)
-        )
+        key, last = (draw.epoch, draw.lens, len(picture)), self._last
+        if last is None or last[0] != key:
+            # A turn leaves the lens as it is, which is round and in the middle.
+            view = CameraView(self._lens_alone(draw), turn=self._turn(draw), supersampling=1)
+            self._last = last = key, view.at(sample.lens, (len(picture), len(picture)))
+        return sample.moved(last[1])
 
     def _view(self, own: Lens, draw: Draw) -> CameraView | CropView:
         if self.lens_augmentation is not None:

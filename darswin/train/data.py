@@ -22,7 +22,7 @@ from darswin.data.splits import Split
 from darswin.data.turns import RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.reader import Coefficients
-from darswin.train.runs import ignore_signals
+from darswin.train.runs import start_worker
 from darswin.utils.parameters import check, check_statistics, naming
 from darswin.utils.tasks import Fit
 from darswin.utils.words import counted
@@ -61,7 +61,8 @@ class RunData(LightningDataModule):
             not define these splits.
         limit: the largest number of pictures in each split.
         batch_size: images in a batch of one process.
-        workers: processes that read and warp pictures; 0 uses the training process.
+        workers: processes that read and warp pictures, in the time that the steps of training
+            leave; 0 uses the training process.
         flip: mirrors half of the training images, together with their lenses.
         rotate_deg: rotates training images about the optical axis, together with their lenses, by
             a random angle of at most this many degrees; 180 allows any angle. Pixels from outside
@@ -99,7 +100,7 @@ class RunData(LightningDataModule):
         holdout: float = 0.1,
         limit: int | None = None,
         batch_size: int = 128,
-        workers: int = 1,
+        workers: int = 2,
         flip: bool = False,
         rotate_deg: float = 0.0,
         lens_augmentation: str | None = None,
@@ -235,7 +236,7 @@ class RunData(LightningDataModule):
             num_workers=self.workers,
             pin_memory=on_gpu,
             prefetch_factor=4 if self.workers else None,
-            worker_init_fn=ignore_signals,
+            worker_init_fn=start_worker,
         )
 
     def _training(self) -> Samples:

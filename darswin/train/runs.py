@@ -212,12 +212,15 @@ class StopOnSignals(Callback):
         return True
 
 
-def ignore_signals(worker: int) -> None:
-    """Makes a DataLoader's worker ignore signals, because the training process ends its workers.
-    If that process is killed, the worker says nothing of the lost connection."""
+def start_worker(worker: int) -> None:
+    """Prepares a worker of a DataLoader. It ignores signals, because the training process ends its
+    workers; if that process is killed, it says nothing of the lost connection. It takes only time
+    that training leaves, because each of torch's operators waits for its slowest thread."""
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     threading.excepthook = _say_no_lost_connection
+    if hasattr(os, "nice"):
+        os.nice(19)
 
 
 def _say_no_lost_connection(error: Any) -> None:

@@ -11,6 +11,7 @@ from kit import plot, tables, targets
 from kit.record import Record, write
 from kit.start import Start
 from kit.tables import BOTH
+from kit.timing import OURS, REFERENCE
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 STARTS = [Start("nano", "darswin", 0.31, 50 * 2**20), Start("nano", "peer", 9.0, 2**30)]
@@ -69,6 +70,14 @@ def test_tables_and_targets_of_a_model(record):
         "peak memory, training, float32, batch 8, in all: 0.80 (target 0.80)",
         "peak memory, training, float32, batch 8, of the batch itself: 0.67 (target 0.80)",
     ]
+
+
+def test_table_of_training():
+    test = dict(images_per_second=300.0, outside=0.5)
+    train = dict(images_per_second=80.0, outside=0.25, bare_images_per_second=100.0)
+    modes = {OURS: train, REFERENCE: train | dict(images_per_second=40.0)}
+    found = peers.training_table({"nano": dict(train=modes, test={OURS: test, REFERENCE: test})})
+    assert found.splitlines()[-1] == "| `nano` | 80 | 2.00× | 25.0% | 0.80 | 300 | 1.00× |"
 
 
 def test_targets_of_operators_and_frames(operators, camera):

@@ -11,7 +11,7 @@ from helpers import refused, slow_but
 from lens_pictures import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
 from PIL import ExifTags, Image
 from scenes import write_plain
-from torch.utils.data import DataLoader
+from torch.utils.data import BatchSampler, DataLoader, default_collate
 
 from darswin.data import (
     IGNORE,
@@ -108,6 +108,8 @@ def test_samples_are_the_same_for_any_number_of_workers(folders, name, threads):
         cameras = None if name.startswith("wide") else dataset.cameras
         order = TrainingOrder(8, 4, rank=0, world=1, cameras=cameras)
         batches.append(list(DataLoader(dataset, 4, sampler=order, num_workers=workers)))
+    groups = BatchSampler(order, 4, drop_last=True)  # one by one, partners share no map
+    batches.append([default_collate([dataset[k] for k in group]) for group in groups])
     assert len(batches[0]) == 2 and len(batches[0][0][1]) == 4
     for other in batches[1:]:
         assert all(same(a, b) for a, b in zip(batches[0], other, strict=True))

@@ -130,6 +130,8 @@ def states():
 assert len(list(states())) >= 3
 while set(states()) != {"S"}:
     time.sleep(0.01)
+for task in os.listdir("/proc/self/task"):  # to wake a thread changes its cores only for a moment
+    assert os.sched_getaffinity(int(task)) == os.sched_getaffinity(0)
 """
 
 
