@@ -80,13 +80,14 @@ struct LinearKernels {
   using Rows = void(const LinearArgs<X>&, int64_t begin, int64_t end, int64_t first, int64_t last);
   Rows* rows;
   // The same with the CPU's products of four bytes, or with AMX; null on tiers without any.
-  Rows *by_fours, *by_tiles;
+  Rows *by_fours = nullptr, *by_tiles = nullptr;
   // Writes panels [first, last) of a weight (columns, depth) behind the parameters at `packed`.
   // This and the next are null for bytes.
   void (*pack)(const float* weight, int64_t columns, int64_t depth, int64_t first, int64_t last,
-               float* packed);
+               float* packed) = nullptr;
   // Writes a panel of a transposed weight, whose rows (depth, columns) are `pitch` apart.
-  void (*pack_rows)(const float* rows, int64_t pitch, int64_t depth, int64_t columns, float* panel);
+  void (*pack_rows)(const float* rows, int64_t pitch, int64_t depth, int64_t columns,
+                    float* panel) = nullptr;
 };
 
 }  // namespace darswin

@@ -136,7 +136,7 @@ def steps_table(record: Record) -> str:
                 [
                     f"`{name}`, batch {batch}",
                     milliseconds(found[OURS], 0),
-                    *(ratios(found[peer], 2) for peer in peers),
+                    *(ratios(found.get(peer, ()), 2) for peer in peers),
                     BOTH.join(f"{1 / t.ratio:.1f}" for t in found[FORWARD]),
                     f"{peaks[0] / peaks[1]:.2f}" if all(peaks) else "",
                 ]

@@ -18,12 +18,12 @@
 #include "../linear.h"
 
 #include "activations.h"
+#include "pack.h"
 #include "quantize.h"
 
 namespace darswin {
 namespace {
 
-constexpr int64_t kL = kLanes<float>;
 constexpr int64_t kPart = 128;   // words of a token in a tile; this part of a panel has 24 KB
 constexpr int64_t kTurned = 16;  // tokens of a transposed matrix: a line of the cache
 constexpr int64_t kTile = 16;    // tokens and words of a tile of AMX
@@ -277,25 +277,21 @@ struct Panel {
     for (; n < width; n += kL) tile<kRows, 1>(x, stride, step, part, row, n, so_far);
   }
 
-  // The same for a few tokens of a transposed matrix. Their words lie far apart and may share few
-  // sets of the cache, so tiles read a copy of them.
+  // The same for a few tokens of a transposed matrix, of which tiles read a copy: the words of a
+  // token lie far apart.
   void turned(const X* token, int64_t count, const Part& part, int64_t row, Sums* so_far) const {
-    using Line = Vector<X, kTurned>;
     X copy[kTurned * kPart];
-    for (int64_t k = 0; k < part.words; ++k) {
-      const X* const from = token + k * a.step;
-      if (count == kTurned) {
-        store(copy + k * kTurned, load<Line>(from));
-      } else {
-        for (int64_t i = 0; i < count; ++i) copy[k * kTurned + i] = from[i];
-      }
+    for (int64_t k = 0; k < part.words; ++k, token += a.step) {
+      X* const to = copy + k * kTurned;
+      if (count == kTurned) store(to, load<Vector<X, kTurned>>(token));
+      if (count < kTurned) __builtin_memcpy(to, token, count * sizeof(X));
     }
-    int64_t i = 0;
-    const auto next = [&]<int kRows>() {
+    const auto next = [&]<int kRows>(int64_t i) {
       tiles<kRows>(copy + i, 1, kTurned, part, row + i, so_far + i * kPanel / kL);
     };
-    for (; i + kTileRows <= count; i += kTileRows) next.template operator()<kTileRows>();
-    for (; i < count; ++i) next.template operator()<1>();
+    int64_t i = 0;
+    for (; i + kTileRows <= count; i += kTileRows) next.template operator()<kTileRows>(i);
+    for (; i < count; ++i) next.template operator()<1>(i);
   }
 
   void rows(int64_t first_row, int64_t last_row) const {
@@ -383,37 +379,6 @@ void linear_rows(const LinearArgs<typename P::X>& a, int64_t begin, int64_t end,
   if constexpr (P::kInTiles) P::Amx::release();
 }
 
-void pack(const float* weight, int64_t columns, int64_t depth, int64_t first, int64_t last,
-          float* packed) {
-  const int64_t padded = padded_columns(columns);
-  for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded); column += kL) {
-    const int64_t begin = column / kPanel * kPanel, width = smaller(kPanel, padded - begin);
-    float* to = packed + padded + begin * depth + column - begin;
-    const float* from = weight + column * depth;
-    int64_t k = 0;
-    for (; column + kL <= columns && k + kL <= depth; k += kL) {
-      Floats rows[kL];
-      for (int64_t i = 0; i < kL; ++i) rows[i] = load<Floats>(from + i * depth + k);
-      transpose_square(rows, to + k * width, width);
-    }
-    for (; k < depth; ++k) {
-      for (int64_t i = 0; i < kL; ++i) {
-        to[k * width + i] = column + i < columns ? from[i * depth + k] : 0;
-      }
-    }
-  }
-}
-
-void pack_rows(const float* rows, int64_t pitch, int64_t depth, int64_t columns, float* panel) {
-  const int64_t padded = padded_columns(columns);
-  for (int64_t k = 0; k < depth; ++k, rows += pitch, panel += padded) {
-    for (int64_t n = 0; n < padded; n += kL) {
-      const int64_t count = columns < n ? 0 : smaller(kL, columns - n);
-      store(panel + n, count == kL ? load<Floats>(rows + n) : load_first(rows + n, count));
-    }
-  }
-}
-
 template <typename P, bool kIsThere>
 constexpr auto if_there() -> decltype(&linear_rows<P>) {
   if constexpr (kIsThere) {
@@ -425,15 +390,10 @@ constexpr auto if_there() -> decltype(&linear_rows<P>) {
 
 }  // namespace
 
-TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<Numbers>,
-                                    .by_fours = nullptr,
-                                    .by_tiles = nullptr,
-                                    .pack = pack,
-                                    .pack_rows = pack_rows};
+TIER_TABLE(LinearKernels<float>) = {
+    .rows = linear_rows<Numbers>, .pack = pack, .pack_rows = pack_rows};
 TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<Pairs>,
                                       .by_fours = if_there<Fours, kHasFours>(),
-                                      .by_tiles = if_there<Tiles, kHasTiles>(),
-                                      .pack = nullptr,
-                                      .pack_rows = nullptr};
+                                      .by_tiles = if_there<Tiles, kHasTiles>()};
 
 }  // namespace darswin
