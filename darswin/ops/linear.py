@@ -18,9 +18,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The linear layer of tokens.
 
     Our own kernels compute the products, forward and backward, where they are faster: in float32,
-    for 128 rows or more, where torch would use MKL on a CPU with AVX2 that is not Intel's. Elsewhere
-    torch computes them: also under autocast, in exported graphs, in compiled inference, and for
-    derivatives other than backward().
+    for 128 rows or more, where torch would use MKL on a CPU with AVX2 that is not Intel's.
+    Elsewhere torch computes them: also under autocast, in exported graphs, in compiled inference,
+    and for derivatives other than backward().
 
     Args:
         x: (..., D).
