@@ -18,9 +18,9 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The linear layer of tokens.
 
     Our own kernels compute the products, forward and backward, where they are faster: in float32,
-    for 128 rows or more, where torch would use MKL on a CPU with AVX2 that is not Intel's.
-    Elsewhere torch computes them: also under autocast, in exported graphs, in compiled inference,
-    and for derivatives other than backward().
+    for 128 rows or more or in compiled training, where torch would use MKL on a CPU with AVX2 that
+    is not Intel's. Elsewhere torch computes them: also under autocast, in exported graphs, in
+    compiled inference, and for derivatives other than backward().
 
     Args:
         x: (..., D).
@@ -64,19 +64,21 @@ def _is_ours(x: Tensor, weight: Tensor) -> bool:
         and x.dtype == weight.dtype == torch.float32
         and x.is_cpu
         and weight.is_cpu
-        and x.numel() >= LEAST_ROWS * x.shape[-1] > 0
         and not _library.reference_in_use()
         and not torch.is_autocast_enabled("cpu")
-        and (_is_compiled_training() if torch.compiler.is_compiling() else not _is_transformed())
+        and (_is_compiled_training if torch.compiler.is_compiling() else _is_long)(x)
     )
 
 
-def _is_compiled_training() -> bool:
+def _is_compiled_training(x: Tensor) -> bool:
+    # Of any length: a graph must not depend on the number of images.
     return torch.is_grad_enabled() and not torch.compiler.is_exporting()
 
 
-def _is_transformed() -> bool:
-    return torch.jit.is_tracing() or forward_ad._current_level >= 0 or _library.transformed()
+def _is_long(x: Tensor) -> bool:
+    """Also that no other derivative may be asked for, and nothing is traced."""
+    is_plain = not torch.jit.is_tracing() and forward_ad._current_level < 0
+    return is_plain and not _library.transformed() and x.numel() >= LEAST_ROWS * x.shape[-1] > 0
 
 
 @_library.register_fake("linear")

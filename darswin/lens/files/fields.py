@@ -145,7 +145,7 @@ class Fields:
     def sections(self, name: str) -> "list[Fields]":
         expected = "a list of mappings"
         entries = self.of_kind(name, list, expected)
-        if not all(isinstance(entry, Mapping) for entry in entries):
+        if not all(issubclass(kind, Mapping) for kind in {*map(type, entries)}):
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(entries)}")
         where = self.path(name)
         return [Fields(entry, f"{where}[{i}].") for i, entry in enumerate(entries)]
