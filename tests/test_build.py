@@ -253,7 +253,8 @@ def test_the_modules_hold_no_path_of_the_build_machine(path):
 
 
 def test_the_modules_export_no_more_than_needed():
-    facts = {"tier", "tiers", "set_tier", "build_info", "byte_products", "use_torch_threads"}
+    facts = {"tier", "tiers", "set_tier", "build_info", "byte_products", "cpu_is_intel"}
+    facts |= {"use_torch_threads"}
     for path, names in [
         (_module.FILE, {f"darswin_{fact}" for fact in facts}),
         (FRAMES, {"PyInit__frames"}),
