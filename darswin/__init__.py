@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from darswin import boxes, compat, frames, lens, models, ops, views
     from darswin.deploy.optimize import optimize
     from darswin.layers.attention import PolarWindowAttention
+    from darswin.lens.rig import Rig
     from darswin.models import DarSwin, create_model, list_models, load_model
     from darswin.views import PolarView
 
@@ -20,6 +21,7 @@ __all__ = [
     "DarSwin",
     "PolarView",
     "PolarWindowAttention",
+    "Rig",
     "boxes",
     "compat",
     "create_model",
@@ -38,6 +40,7 @@ _MODULES = {
     "DarSwin": "darswin.models",
     "PolarView": "darswin.views",
     "PolarWindowAttention": "darswin.layers.attention",
+    "Rig": "darswin.lens.rig",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
     "load_model": "darswin.models",

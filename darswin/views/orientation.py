@@ -8,26 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.utils.angles import check_turn
+from darswin.utils.angles import check_turn, unit_vector
 from darswin.utils.arrays import as_tensor
 
 Vector = Sequence[float] | Tensor
 
 PICTURE_TOP = (0.0, -1.0, 0.0)
 AXIS = (0.0, 0.0, 1.0)
-
-
-def unit_vector(name: str, vector: Vector) -> tuple[float, float, float]:
-    """The unit vector of three finite numbers that are not all 0; ValueError otherwise."""
-    try:
-        values = [float(x) for x in (vector.tolist() if hasattr(vector, "tolist") else vector)]
-    except (TypeError, ValueError):
-        values = []
-    length = math.hypot(*values)
-    if len(values) != 3 or not 0 < length < math.inf:
-        raise ValueError(f"{name} must be three finite numbers that are not all 0, got {vector!r}")
-    x, y, z = (value / length for value in values)
-    return x, y, z
 
 
 def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> list[list[float]]:
