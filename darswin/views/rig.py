@@ -3,7 +3,6 @@
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -19,13 +18,22 @@ from darswin.utils.parameters import check
 from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, View
 from darswin.views.remap import Remap, aside
-from darswin.views.rig_reads import Reads, Seam, Seen, corners, grid, read_at, reads_of, see
+from darswin.views.rig_reads import (
+    Frames,
+    Reads,
+    Seam,
+    Seen,
+    corners,
+    grid,
+    in_order,
+    read_at,
+    reads_of,
+    see,
+)
 
 if TYPE_CHECKING:
     from darswin.frames.plans import Sampler
     from darswin.frames.rig_plans import RigPlan
-
-Frames = Sequence[Any] | Mapping[str, Any]
 
 _ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
 _ONE_PLACE = 1e-6  # m
@@ -125,7 +133,7 @@ class RigRemap:
         Raises:
             TypeError, ValueError: frames are missing, unknown, of other sizes or of unequal types.
         """
-        frames = self._listed(frames)
+        frames = in_order(frames, self.rig)
         gains = self.gains(frames) if self.gain else None
         if isinstance(frames[0], Tensor):
             return self._mixed([View.floating(self.view, f, torch.float32) for f in frames], gains)
@@ -151,7 +159,7 @@ class RigRemap:
             (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where the
             view shows nothing.
         """
-        targets, picture = self._listed(targets, dims=2), None
+        targets, picture = in_order(targets, self.rig, maps=True), None
         for number, target in enumerate(targets):
             kind = target.dtype.newbyteorder("=")
             if picture is None:
@@ -188,7 +196,7 @@ class RigRemap:
             check(name, repr(kind), kind in ("distance", "z"), "distance or z")
         if self.view.is_surface or self.rig.spread > _ONE_PLACE:
             raise ValueError("distances are those of a view if all cameras are at its place")
-        depths = self._listed(depths, dims=2)
+        depths = in_order(depths, self.rig, maps=True)
         distances = np.full(self._count, np.nan)
         for number, (depth, remap) in enumerate(zip(depths, self.sources.values(), strict=True)):
             mine, (x, y) = self._nearest(number)
@@ -219,7 +227,7 @@ class RigRemap:
             C) float32, from the frames of both.
         """
         values = []
-        for frame, pixels in zip(self._listed(frames), self._seen.pixels, strict=True):
+        for frame, pixels in zip(in_order(frames, self.rig), self._seen.pixels, strict=True):
             planes = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None].float()
             values.append(read_at(planes, np.nan_to_num(pixels))[0].T.numpy())
         shown = self._seen.room >= 0
@@ -242,7 +250,7 @@ class RigRemap:
         rows, goals = [np.ones(len(names))], [0.0]
         for (a, b), (_, (first, second)) in self.overlaps(frames).items():
             inside = np.ones(first.shape[:1], bool)
-            if self._listed(frames)[0].dtype == np.uint8:
+            if in_order(frames, self.rig)[0].dtype == np.uint8:
                 both = np.concatenate((first, second), 1)
                 inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
             sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
@@ -348,41 +356,6 @@ class RigRemap:
         points = self._seen.pixels[number, mine] + aside(self.view_size).reshape(-1, 2)[mine]
         last = np.array(self.source(number).size[::-1]) - 1
         return mine, np.rint(points.clip(0, last)).astype(np.intp).T
-
-    def _listed(self, frames: Frames, dims: int | None = None) -> list[Any]:
-        """Frames of the cameras in their order; TypeError or ValueError for wrong ones."""
-        names = self.rig.names
-        if isinstance(frames, Mapping):
-            if {*frames} != {*names}:
-                wrong = sorted({*frames} ^ {*names}, key=str)
-                what = "is missing" if wrong[0] in names else f"is no camera of {', '.join(names)}"
-                raise ValueError(f"the frame {wrong[0]!r} {what}")
-            frames = [frames[name] for name in names]
-        if isinstance(frames, np.ndarray | Tensor) or len(frames) != len(names):
-            raise ValueError(
-                f"there must be a frame for each of {len(names)} cameras, got {len(frames)}"
-            )
-        kinds = {(type(f), getattr(f, "dtype", None), np.shape(f)[2:] if isinstance(f, np.ndarray)
-                  else np.shape(f)[:2]) for f in frames}  # fmt: skip
-        if len(kinds) > 1:
-            raise TypeError("all frames must have one type and one number of channels")
-        for name, frame in zip(names, frames, strict=True):
-            if not isinstance(frame, np.ndarray | Tensor):
-                raise TypeError(f"frame {name} must be an array or a tensor, got {type(frame)}")
-            shape, size = tuple(frame.shape), self.rig[name].size
-            tensor = isinstance(frame, Tensor)
-            if (shape[2:] if tensor else shape[:2]) != size or len(shape) > 3 + tensor:
-                raise ValueError(f"frame {name} must be of (H, W) = {size}, got shape {shape}")
-            if dims is not None and (tensor or len(shape) != dims):
-                raise ValueError(f"the map of {name} must be an array (H, W), got shape {shape}")
-            if (
-                dims is None
-                and not tensor
-                and np.dtype(frame.dtype).kind in "iu"
-                and frame.itemsize > 2
-            ):
-                raise TypeError(f"frames of {frame.dtype} would be mixed: remap.target moves ids")
-        return list(frames)
 
     def _mixed(self, images: list[Tensor], gains: np.ndarray | None) -> Tensor:
         """The view of images (B, C, H, W) in floating point: (B, C, H', W')."""
