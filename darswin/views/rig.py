@@ -118,6 +118,11 @@ class RigRemap:
         """The pixels of the view that show something of a picture, (H', W')."""
         return np.bincount(self.reads.pixels, minlength=self._count).reshape(self.view_size) > 0
 
+    @property
+    def seen_by(self) -> np.ndarray:
+        """Whether each of the n cameras sees each pixel of the view, (n, H', W')."""
+        return self._seen.room.reshape(-1, *self.view_size) >= 0
+
     # -- frames -------------------------------------------------------------------------------
 
     def __call__(self, frames: Frames) -> Any:

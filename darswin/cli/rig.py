@@ -1,0 +1,282 @@
+"""`darswin rig`: draws a rig of cameras, stitches their pictures, and checks whether they agree."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from darswin.cli.arguments import check_out
+from darswin.cli.rig_fisheye import fisheye
+from darswin.cli.views import Look, Up
+from darswin.lens.files.reader import Coefficients
+from darswin.lens.rig import Camera, Rig
+from darswin.utils.parameters import check
+from darswin.utils.words import counted, in_px
+from darswin.views import GroundView, PixelView, RayView
+from darswin.views.registry import flat_views, view_class
+from darswin.views.rig_reads import Seam
+
+if TYPE_CHECKING:
+    from darswin.views.rig import RigRemap
+
+Direction = Literal["camera_to_rig", "rig_to_camera"]
+Place = Literal["ground", "equirectangular"]
+VIEWS = ("ground", *(name for name in flat_views() if issubclass(view_class(name), RayView)))
+MOST_PIXELS, SIDE, TRIED = 2**24, 800, 160  # of a view; its longer side, by default and in `compare`
+SPAN = 12.0  # m of the ground
+RECORD = "rig.json"
+LOWEST = 0.1  # m above the ground: a rig whose cameras are all higher is shown there
+# What `compare` tries of one camera at a time.
+TURNS, MOVES = (0.5, 1.0, 2.0), (2, 5)  # degrees, cm
+CLEAR, LEAST = 0.2, 0.5  # the part of the difference, and units of 255, by which it must shrink
+
+
+def show(
+    rig: str, pictures: Sequence[str] = (), *, out: str = "rig.png", view: Place | None = None,
+    span: float | None = None, up: Up | None = None, height: float | None = None,
+    direction: Direction | None = None, coefficients: Coefficients | None = None,
+) -> None:  # fmt: skip
+    """Draws the cameras of a rig from above and from the side, and how many see each place.
+
+    Prints where each camera is, in metres from the rig's origin, and where it looks: yaw to the
+    right, pitch up, and roll clockwise.
+
+    Args:
+        pictures: a picture of each camera to draw too: see `darswin rig stitch`. Of frames, the
+            first counts.
+        out: the file to write; its ending names the format: png, jpg, webp, tif, pdf or svg.
+        view: whether the drawing is of the ground or of all directions. The default is the ground
+            if all cameras are above it.
+    """
+    from darswin.viz.plot import figure_format, save_figure
+    from darswin.viz.rig import draw_rig
+
+    figure_format(out)
+    check_out(out, ())
+    cameras = open_rig(rig, up, height, direction, coefficients)
+    remap = _view(cameras, view, span=span).at(cameras, seam="narrow")
+    picture = remap(_first(cameras, pictures)) if pictures else None
+    counts, what = remap.seen_by.sum(0), "sphere"
+    weights = np.ones(counts.shape)
+    if isinstance(remap.view, GroundView):
+        what = f"ground, {remap.view.span:g} m wide"
+    else:  # rows are latitudes
+        weights *= np.sin(math.pi * (np.arange(len(counts)) + 0.5) / len(counts))[:, None]
+    none, one = (np.average(counts == k, weights=weights) for k in (0, 1))
+    save_figure(draw_rig(remap, picture), out)
+    for name, camera in cameras.cameras.items():
+        print(f"{name}: {_described(camera, cameras)}")
+    parts = f"{one:.1%} are seen by one camera, {1 - one - none:.1%} by more and {none:.1%} by none"
+    print(f"of the {what}, {parts}\n{out}")
+
+
+def stitch(
+    rig: str, pictures: Sequence[str], *, out: str, view: str | None = None,
+    size: tuple[int, int] | None = None, span: float | None = None,
+    center: tuple[float, float] | None = None, rise: float | None = None,
+    fov_deg: float | None = None, yaw_deg: float = 0.0, pitch_deg: float = 0.0,
+    seam: Seam = "narrow", gain: bool = False, distance: float | None = None, up: Up | None = None,
+    height: float | None = None, direction: Direction | None = None,
+    coefficients: Coefficients | None = None,
+) -> None:  # fmt: skip
+    """Writes one picture of what all cameras of a rig see: the ground from above, or a panorama.
+
+    Args:
+        pictures: a folder with a picture of each camera, named after it, such as front.png, or with
+            a folder of frames for each, such as front/0001.png; or words NAME=PATH.
+        out: the picture to write; of frames, a folder.
+        view: ground, or a map of directions such as equirectangular or perspective. The default is
+            the ground if all cameras are above it, and else equirectangular.
+        size: height and width of the picture, px. The default is 800,800 for the ground, and else
+            512,1024.
+        seam: hard: each place from one camera; narrow: mixed in the middle of an overlap; wide:
+            mixed in all of it.
+        gain: whether each camera gets a factor that makes all equally bright.
+    """
+    from darswin.cli.pictures import claim_folder, is_below
+    from darswin.cli.rig_files import files_of, read_frames
+    from darswin.utils.image import WRITTEN, write_image
+    from darswin.utils.progress import Progress
+
+    cameras = open_rig(rig, up, height, direction, coefficients)
+    look = Look("", fov_deg, yaw_deg, pitch_deg, None)
+    shown = _view(cameras, view, size, look, span=span, center=center, rise=rise)
+    remap = shown.at(cameras, seam=seam, gain=gain, distance=distance)
+    frames = files_of(pictures, cameras.names)
+    folder = Path(out).parent
+    names = {"": Path(out).name}
+    if "" not in frames:
+        for word in pictures:
+            is_apart = not is_below(word.partition("=")[2] or word, out)
+            check("out", out, is_apart, "a folder without the originals")
+        folder, names = claim_folder(out, RECORD), {frame: f"{frame}.png" for frame in frames}
+    else:
+        ending = Path(out).suffix.lower() in WRITTEN
+        check("out", out, ending, f"a file that ends in one of {', '.join(sorted(WRITTEN))}")
+        check_out(out, map(str, frames[""].values()))
+    with Progress("stitch", len(frames)) as progress:
+        for frame, files in frames.items():
+            write_image(folder / names[frame], remap(read_frames(cameras, files)))
+            progress.done += 1
+    print(f"{out}: {counted(len(frames), 'picture')}, {in_px(remap.view_size)}")
+
+
+def compare(
+    rig: str, pictures: Sequence[str], *, out: str | None = None, view: Place | None = None,
+    span: float | None = None, distance: float | None = None, up: Up | None = None,
+    height: float | None = None, direction: Direction | None = None,
+    coefficients: Coefficients | None = None,
+) -> None:  # fmt: skip
+    """Measures how much the cameras of a rig disagree where they see the same places.
+
+    Wrong poses, heights and lenses show, and also things that stand on the ground. It also tries
+    small turns and moves of each camera alone, and says which would agree clearly better.
+
+    Args:
+        pictures: a picture of each camera: see `darswin rig stitch`. Of frames, the first counts.
+        out: the file for a drawing of the differences; its ending names the format, as for show.
+        view: whether the cameras are compared on the ground or in all directions. The default is
+            the ground if all cameras are above it.
+    """
+    from darswin.viz.plot import figure_format, save_figure
+    from darswin.viz.rig import draw_differences
+
+    if out is not None:
+        figure_format(out)
+        check_out(out, ())
+    cameras = open_rig(rig, up, height, direction, coefficients)
+    shown = _view(cameras, view, span=span, side=TRIED)
+    remap = shown.at(cameras, distance=distance)
+    frames = _first(cameras, pictures)
+    gains = dict(zip(cameras.names, remap.gains(frames), strict=True))
+    levelled = {name: frame.astype(np.float32) * gains[name] for name, frame in frames.items()}
+    means, apart = remap.disagreement(levelled)
+    if not means:
+        raise ValueError("no two cameras see the same places, so there is nothing to compare")
+    for (first, second), mean in means.items():
+        print(f"{first} and {second} differ by {mean:.1f} of 255")
+    for name, gain in gains.items():
+        if abs(gain - 1) >= 0.01:
+            print(f"{name} is too {'dark' if gain > 1 else 'bright'}: its factor is {gain:.2f}")
+    better = _better(remap, levelled)
+    print(*(better or ["no small turn or move of one camera agrees clearly better"]), sep="\n")
+    if out is not None:
+        save_figure(draw_differences(remap, apart), out)
+        print(out)
+
+
+def open_rig(
+    rig: str, up: Up | None, height: float | None, direction: Direction | None,
+    coefficients: Coefficients | None,
+) -> Rig:  # fmt: skip
+    """The rig of a file or a folder, or of `cube:SIDE`."""
+    name, colon, side = rig.partition(":")
+    if name != "cube" or not colon:
+        return Rig.load(
+            rig, up=up, height=height, direction=direction, coefficients=coefficients
+        )
+    given = dict(up=up, height=height, direction=direction, coefficients=coefficients)
+    for option, value in given.items():
+        check(option, value, value is None, "left out for a cube")
+    if not side.isdecimal():
+        raise ValueError(f"a cube is cube:SIDE, with the side of its pictures in px, got {rig}")
+    return Rig.cube(int(side))
+
+
+def _view(
+    rig: Rig, name: str | None, size: tuple[int, int] | None = None,
+    look: Look = Look("", None, 0.0, 0.0, None), side: int = SIDE, **ground: Any,
+) -> PixelView:  # fmt: skip
+    """A view of (H, W), or else of its usual shape with a longest side; ground: the arguments of
+    `GroundView`, None for their defaults."""
+    if name is None:
+        lowest = min(camera.pose[:3, 3] @ rig.up for camera in rig.cameras.values())
+        name = "ground" if lowest > LOWEST else "equirectangular"
+    check("view", name, name in VIEWS, f"one of {', '.join(VIEWS)}")
+    size = size or ((side, side) if name == "ground" else (side // 2, side))
+    fits = min(size) >= 2 and math.prod(size) <= MOST_PIXELS
+    check("size", size, fits, f"at least 2,2 and at most {MOST_PIXELS} px in all")
+    if name != "ground":
+        for option, value in ground.items():
+            check(option, value, value is None, f"left out for a {name} view")
+        look = look._replace(view=name)
+        look.check()
+        return look.make(size, look.fov_deg)
+    for option in ("fov_deg", "yaw_deg", "pitch_deg"):
+        value = getattr(look, option)
+        check(option, value, not value, "left out for the ground")
+    right, _, ahead = rig.middle @ rig.level
+    usual = dict(span=SPAN, center=(ahead, -right))
+    return GroundView(size, **usual | {k: v for k, v in ground.items() if v is not None})
+
+
+def _first(rig: Rig, pictures: Sequence[str]) -> "dict[str, np.ndarray]":
+    """The pictures of the first frame."""
+    from darswin.cli.rig_files import files_of, read_frames
+
+    return read_frames(rig, min(files_of(pictures, rig.names).items())[1])
+
+
+def _described(camera: Camera, rig: Rig) -> str:
+    """The lens, place and direction of a camera in words."""
+    right, down, ahead = (rig.level.T @ camera.pose[:3, :3]).T
+    x, y, z = camera.pose[:3, 3] @ rig.level
+    yaw, pitch = math.atan2(ahead[0], ahead[2]), math.asin(max(-1.0, min(1.0, -ahead[1])))
+    if abs(ahead[1]) > 1 - 1e-9:  # straight up or down, yaw is that of the picture's top
+        yaw = math.atan2(-right[2], right[0])
+    level = np.array((math.cos(yaw), 0, -math.sin(yaw)))
+    roll = math.atan2(right @ np.cross(ahead, level), right @ level)
+    angles = (f"{name} {math.degrees(angle) + 0:.1f}°" for name, angle in
+              (("yaw", yaw), ("pitch", pitch), ("roll", roll)))  # fmt: skip
+    place = f"{z:.2f} m ahead, {-x:.2f} m to the left, {-y:.2f} m up"
+    return f"{type(camera.lens).__name__}, {in_px(camera.size)}; {place}; {', '.join(angles)}"
+
+
+def _better(remap: "RigRemap", frames: "dict[str, np.ndarray]") -> list[str]:
+    """The small changes of one camera by which the frames agree clearly better, best first."""
+    rig, found = remap.rig, []
+
+    def apart(name: str, camera: Camera) -> tuple[float, int]:
+        """The mean difference where a camera and another see the view, and the count of pixels."""
+        changed = Rig(rig.cameras | {name: camera}, up=rig.up, forward=rig.forward)
+        pairs = remap.view.at(changed, distance=remap.distance).overlaps(frames).items()
+        parts = [np.abs(a - b).mean(1) for names, (_, (a, b)) in pairs if name in names]
+        return (float(np.concatenate(parts).mean()), sum(map(len, parts))) if parts else (0.0, 0)
+
+    for name, camera in rig.cameras.items():
+        now, count = apart(name, camera)
+        best, words = now, ""
+        for how, changed in _changes(camera, rig, remap):
+            then, left = apart(name, changed)
+            if then < best and left > count / 2:
+                best, words = then, how
+        if best <= min((1 - CLEAR) * now, now - LEAST):
+            text = f"{name}: {words}, its pictures agree better ({now:.1f} → {best:.1f})"
+            found.append((best / now, text))
+    return [text for _, text in sorted(found)]
+
+
+def _changes(camera: Camera, rig: Rig, remap: "RigRemap") -> Iterator[tuple[str, Camera]]:
+    """Small turns of a camera, and moves along the vertical if they matter, with their names."""
+    import cv2
+
+    pose, up = camera.pose, np.array(rig.up)
+    axes = ((-up, "right", "left"), (pose[:3, 0], "up", "down"),
+            (pose[:3, 2], "clockwise", "counterclockwise"))  # fmt: skip
+    for axis, forth, back in axes:
+        for degrees in (sign * turn for turn in TURNS for sign in (1, -1)):
+            turned = pose.copy()
+            turned[:3, :3] = cv2.Rodrigues(math.radians(degrees) * axis)[0] @ pose[:3, :3]
+            words = f"turned by {abs(degrees):g}° {forth if degrees > 0 else back}"
+            yield words, camera._replace(pose=turned)
+    if remap.view.is_surface or remap.distance is not None:
+        for move in (sign * move for move in MOVES for sign in (1, -1)):
+            moved = pose.copy()
+            moved[:3, 3] += move / 100 * up
+            words = f"{abs(move)} cm {'higher' if move > 0 else 'lower'}"
+            yield words, camera._replace(pose=moved)
+
+
+COMMANDS = {"show": show, "stitch": stitch, "check": compare, "fisheye": fisheye}
