@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 
 from darswin.cli.arguments import check_out
 from darswin.cli.rig_fisheye import fisheye
@@ -16,7 +17,7 @@ from darswin.utils.parameters import check
 from darswin.utils.words import counted, in_px
 from darswin.views import GroundView, PixelView, RayView
 from darswin.views.registry import flat_views, view_class
-from darswin.views.rig_reads import Seam
+from darswin.views.rig_reads import Seam, read_at, see
 
 if TYPE_CHECKING:
     from darswin.views.rig import RigRemap
@@ -24,12 +25,13 @@ if TYPE_CHECKING:
 Direction = Literal["camera_to_rig", "rig_to_camera"]
 Place = Literal["ground", "equirectangular"]
 VIEWS = ("ground", *(name for name in flat_views() if issubclass(view_class(name), RayView)))
-MOST_PIXELS, SIDE, TRIED = 2**24, 800, 160  # of a view; its longer side, by default and in `compare`
+MOST_PIXELS = 2**24  # of a view
+SIDE, DRAWN, COMPARED = 800, 400, 160  # px, the longer side of a view: by default, in drawings …
 SPAN = 12.0  # m of the ground
 RECORD = "rig.json"
 LOWEST = 0.1  # m above the ground: a rig whose cameras are all higher is shown there
 # What `compare` tries of one camera at a time.
-TURNS, MOVES = (0.5, 1.0, 2.0), (2, 5)  # degrees, cm
+TURNS, MOVES, POINTS = (0.5, 1.0, 2.0), (2, 5), 4000  # degrees, cm, and places at most
 CLEAR, LEAST = 0.2, 0.5  # the part of the difference, and units of 255, by which it must shrink
 
 
@@ -56,7 +58,7 @@ def show(
     figure_format(out)
     check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
-    remap = _view(cameras, view, span=span).at(cameras, seam="narrow")
+    remap = _view(cameras, view, span=span, side=DRAWN).at(cameras, seam="narrow")
     picture = remap(_first(cameras, pictures)) if pictures else None
     counts, what = remap.seen_by.sum(0), "sphere"
     weights = np.ones(counts.shape)
@@ -147,7 +149,7 @@ def compare(
         figure_format(out)
         check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
-    shown = _view(cameras, view, span=span, side=TRIED)
+    shown = _view(cameras, view, span=span, side=COMPARED)
     remap = shown.at(cameras, distance=distance)
     frames = _first(cameras, pictures)
     gains = dict(zip(cameras.names, remap.gains(frames), strict=True))
@@ -157,6 +159,7 @@ def compare(
         raise ValueError("no two cameras see the same places, so there is nothing to compare")
     for (first, second), mean in means.items():
         print(f"{first} and {second} differ by {mean:.1f} of 255")
+    print(f"in all overlaps, cameras differ by {np.nanmean(apart):.1f} of 255")
     for name, gain in gains.items():
         if abs(gain - 1) >= 0.01:
             print(f"{name} is too {'dark' if gain > 1 else 'bright'}: its factor is {gain:.2f}")
@@ -230,40 +233,51 @@ def _described(camera: Camera, rig: Rig) -> str:
     roll = math.atan2(right @ np.cross(ahead, level), right @ level)
     angles = (f"{name} {math.degrees(angle) + 0:.1f}°" for name, angle in
               (("yaw", yaw), ("pitch", pitch), ("roll", roll)))  # fmt: skip
-    place = f"{z:.2f} m ahead, {-x:.2f} m to the left, {-y:.2f} m up"
+    place = "{:.2f} m ahead, {:.2f} m to the left, {:.2f} m up".format(*np.round((z, -x, -y), 2) + 0)
     return f"{type(camera.lens).__name__}, {in_px(camera.size)}; {place}; {', '.join(angles)}"
 
 
 def _better(remap: "RigRemap", frames: "dict[str, np.ndarray]") -> list[str]:
-    """The small changes of one camera by which the frames agree clearly better, best first."""
+    """The small changes of one camera by which frames (H, W, C) float32 agree clearly better, best
+    first."""
     rig, found = remap.rig, []
+    images = [torch.from_numpy(frame).movedim(2, 0)[None].contiguous() for frame in frames.values()]
 
-    def apart(name: str, camera: Camera) -> tuple[float, int]:
-        """The mean difference where a camera and another see the view, and the count of pixels."""
-        changed = Rig(rig.cameras | {name: camera}, up=rig.up, forward=rig.forward)
-        pairs = remap.view.at(changed, distance=remap.distance).overlaps(frames).items()
-        parts = [np.abs(a - b).mean(1) for names, (_, (a, b)) in pairs if name in names]
-        return (float(np.concatenate(parts).mean()), sum(map(len, parts))) if parts else (0.0, 0)
+    def apart(number: int, camera: Camera, points: np.ndarray) -> float:
+        """The mean difference of a camera from others at points of the view; ∞ if most are lost."""
+        changed = rig.cameras | {rig.names[number]: camera}
+        seen = see(remap.view, Rig(changed, up=rig.up, forward=rig.forward), remap.distance, points)
+        values = [
+            read_at(image, np.nan_to_num(at))[0].numpy()
+            for image, at in zip(images, seen.pixels, strict=True)
+        ]
+        both = (seen.room >= 0) & (seen.room[number] >= 0)
+        both[number] = False
+        if both.any(0).mean() < 0.5:
+            return math.inf
+        return float(np.abs(values - values[number]).mean(1)[both].mean())
 
-    for name, camera in rig.cameras.items():
-        now, count = apart(name, camera)
-        best, words = now, ""
-        for how, changed in _changes(camera, rig, remap):
-            then, left = apart(name, changed)
-            if then < best and left > count / 2:
-                best, words = then, how
+    for number, (name, camera) in enumerate(rig.cameras.items()):
+        shared = remap.seen_by[number] & (remap.seen_by.sum(0) > 1)
+        points = np.argwhere(shared)[:, ::-1].astype(np.float64)
+        if not len(points):
+            continue
+        points = points[:: -(-len(points) // POINTS)]
+        now = apart(number, camera, points)
+        changes = ((apart(number, c, points), how) for how, c in _changes(camera, remap))
+        best, how = min(changes)
         if best <= min((1 - CLEAR) * now, now - LEAST):
-            text = f"{name}: {words}, its pictures agree better ({now:.1f} → {best:.1f})"
+            text = f"{name}: {how}, its pictures agree better ({now:.1f} → {best:.1f})"
             found.append((best / now, text))
     return [text for _, text in sorted(found)]
 
 
-def _changes(camera: Camera, rig: Rig, remap: "RigRemap") -> Iterator[tuple[str, Camera]]:
+def _changes(camera: Camera, remap: "RigRemap") -> Iterator[tuple[str, Camera]]:
     """Small turns of a camera, and moves along the vertical if they matter, with their names."""
     import cv2
 
-    pose, up = camera.pose, np.array(rig.up)
-    axes = ((-up, "right", "left"), (pose[:3, 0], "up", "down"),
+    pose, up = camera.pose, np.array(remap.rig.up)
+    axes = ((-up, "to the right", "to the left"), (pose[:3, 0], "up", "down"),
             (pose[:3, 2], "clockwise", "counterclockwise"))  # fmt: skip
     for axis, forth, back in axes:
         for degrees in (sign * turn for turn in TURNS for sign in (1, -1)):

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from darswin.lens.rig import Camera, Rig
 from darswin.utils.image import with_channels
@@ -37,7 +38,7 @@ def draw_rig(remap: RigRemap, picture: np.ndarray | None = None) -> Figure:
     figure = page_figure(3.1 * (1 + len(rows)))
     panels = figure.subplot_mosaic([["above", "side"], *rows])
     titles = {"above": "cameras, from above", "side": "from the right",
-              "counts": "seen by", "picture": "stitched"}  # fmt: skip
+              "counts": "number of cameras", "picture": "stitched"}  # fmt: skip
     _draw_cameras(panels["above"], remap.rig, ABOVE)
     _draw_cameras(panels["side"], remap.rig, SIDE)
     panels["above"].set(xlabel="m to the right", ylabel="m ahead")
@@ -88,7 +89,7 @@ def _lines(rig: Rig) -> list[Line2D]:
 
 def _draw_cameras(axes: Axes, rig: Rig, paper: np.ndarray) -> None:
     """Draws the places, the axes and the fields of view of cameras, projected to `paper`."""
-    length = 0.6 * max(rig.spread, LEAST)
+    length = 0.6 * max(rig.spread, rig.middle @ rig.up / 2, LEAST)
     axes.plot(0, 0, "+", color="0.4", ms=10)  # the origin
     for name, colour in _colours(rig).items():
         camera = rig[name]
@@ -128,6 +129,8 @@ def _draw_map(
     drawn = axes.imshow(image, extent=extent, **options)
     axes.patch.set(**HATCH)
     axes.set(xlabel=names[0], ylabel=names[1])
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 3, 5, 6, 10]))
     for seen, colour in zip(remap.seen_by, _colours(remap.rig).values(), strict=True):
         if seen.any() and not seen.all():
             axes.contour(seen, [0.5], colors=[colour], extent=extent, origin="upper", linewidths=1.2)

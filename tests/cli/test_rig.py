@@ -1,0 +1,162 @@
+"""`darswin rig`, on analytic scenes: a textured ground, and a box around a cube of six faces."""
+
+import math
+import re
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers import ended
+from PIL import Image
+
+from darswin.cli.main import main
+from darswin.data import open_scenes
+from darswin.lens import Equidistant, KannalaBrandt, load, save
+from darswin.lens.rig import CUBES, Rig
+from darswin.utils.image import read_image
+from darswin.views import GroundView
+
+SIZE = (240, 320)
+FISHEYE = KannalaBrandt(86.0, [0.01, -0.004, 0.001, 0.0], 1.66, image_size=SIZE)
+# Yaw to the right and pitch up, degrees, and places (x ahead, y to the left, z up), m.
+PLACES = {
+    "front": (0, -20, (3.7, 0.0, 0.6)), "right": (90, -40, (2.0, -1.0, 1.0)),
+    "back": (180, -20, (-1.0, 0.0, 0.9)), "left": (-90, -40, (2.0, 1.0, 1.0)),
+}  # fmt: skip
+TO = Equidistant(20.0, 1.65, image_size=(64, 72))
+
+
+def pose(yaw, pitch, place):
+    yaw, pitch, matrix = math.radians(yaw), math.radians(pitch), np.eye(4)
+    level = np.array((math.cos(yaw), -math.sin(yaw), 0.0))
+    ahead = math.cos(pitch) * level + (0, 0, math.sin(pitch))
+    right = np.cross(level, (0, 0, 1))
+    matrix[:3] = np.stack((right, np.cross(ahead, right), ahead, place), 1)
+    return matrix
+
+
+def car(lens=FISHEYE, **changed):
+    """A rig of four cameras above the ground."""
+    places = PLACES | changed
+    return Rig({name: (lens, SIZE, pose(*place)) for name, place in places.items()})
+
+
+def ground(x, y):
+    """The colours of the ground at x ahead and y to the left, m."""
+    turns = ((1.7, 0.6), (-0.9, 1.5), (0.5, -1.9))
+    planes = [60 * np.sin(2 * (a * x + b * y)) + 40 * np.sin(3.1 * (b * x - a * y)) for a, b in turns]
+    return 128 + np.exp(-np.hypot(x, y) / 8)[..., None] * np.stack(planes, -1)
+
+
+def of_ground(place, rays):
+    with np.errstate(divide="ignore"):
+        along = np.where(rays[..., 2] < -1e-3, -place[2] / rays[..., 2], 1e9)
+    return ground(*(place[k] + along * rays[..., k] for k in (0, 1)))
+
+
+def of_box(place, rays):
+    """The distances of the sides of a box around the origin, its labels and its colours."""
+    sides = np.where(rays > 0, (4.0, 2.0, 6.0), (5.0, 1.5, 3.0))
+    along = np.min(sides / np.abs(rays).clip(1e-9), -1)
+    hit = along[..., None] * rays
+    labels = np.argmax(np.abs(rays) / sides, -1) * 2 + (np.take_along_axis(
+        rays, np.argmax(np.abs(rays) / sides, -1)[..., None], -1)[..., 0] > 0)  # fmt: skip
+    return along, labels, 128 + 90 * np.sin(1.5 * hit)
+
+
+def rays_of(camera, fine=3):
+    """Unit vectors in the rig's frame of `fine`² points of each pixel, NaN beyond θ_max."""
+    y, x = ((np.arange(side * fine) + 0.5) / fine - 0.5 for side in camera.size)
+    points = torch.from_numpy(np.stack(np.meshgrid(x, y), -1))[None]
+    rays = camera.lens.unproject_points(points, camera.size)[0].numpy() @ camera.pose[:3, :3].T
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def shoot(camera, scene=of_ground, fine=2):
+    """The picture of a camera, black beyond θ_max."""
+    (height, width), rays = camera.size, rays_of(camera, fine)
+    colours = np.nan_to_num(scene(camera.pose[:3, 3], rays))
+    picture = colours.reshape(height, fine, width, fine, 3).mean((1, 3))
+    return np.rint(picture).clip(0, 255).astype(np.uint8)
+
+
+def write(path, picture):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture).save(path)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return {name: shoot(camera) for name, camera in car().cameras.items()}
+
+
+RIGS = {
+    "car": car(),
+    "yaw": car(left=(-88, -40, (2.0, 1.0, 1.0))),
+    "height": car(front=(0, -20, (3.7, 0.0, 0.65))),
+    "lens": car(Equidistant(86.0, 1.66, image_size=SIZE)),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, pictures):
+    """The pictures of the car in `car/`, and its rigs by name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Rig, "load", staticmethod(lambda path, **_: RIGS[path]), raising=False)
+    monkeypatch.setattr("darswin.views.rig._module.LACK", "no sampler yet")
+    for name, picture in pictures.items():
+        write(tmp_path / "car" / f"{name}.png", picture)
+    return tmp_path
+
+
+def test_show_lists_and_draws_the_cameras(folder, capsys):
+    main("rig show car car --out car.png".split())
+    said = capsys.readouterr().out.splitlines()
+    assert "left: KannalaBrandt, 240 × 320 px (H × W); 2.00 m ahead, 1.00 m to the left, 1.00 m up; " \
+           "yaw -90.0°, pitch -40.0°, roll 0.0°" in said  # fmt: skip
+    y, x = np.mgrid[-6:6:100j, -6:6:100j]
+    _, seen = RIGS["car"].project(np.stack((x + 1.675, y, 0 * x), -1))
+    shares = re.findall(r"([\d.]+)%", said[4])
+    counts = seen.sum(0)
+    for share, found in zip(shares, (counts == 1, counts > 1, counts == 0), strict=True):
+        assert abs(float(share) - 100 * found.mean()) < 0.6
+    assert said[5] == "car.png" and Image.open("car.png").size[0] == 1200
+    main("rig show cube:16 --out cube.pdf".split())
+    said = capsys.readouterr().out
+    assert "down: Perspective" in said and "yaw 0.0°, pitch -90.0°, roll 0.0°" in said
+    assert "of the sphere, 100.0% are seen by one camera, 0.0% by more and 0.0% by none" in said
+
+
+def test_stitch_shows_the_ground(folder, capsys):
+    main("rig stitch car car --size 160,160 --span 8 --center 1.4,0.5 --out new.png".split())
+    assert capsys.readouterr().out == "new.png: 1 picture, 160 × 160 px (H × W)\n"
+    y, x = np.mgrid[:160, :160]
+    truth, found = ground(5.4 - (y + 0.5) / 20, 4.5 - (x + 0.5) / 20), read_image("new.png")
+    shown = found.any(-1)
+    assert shown.mean() > 0.98 and np.abs(found - truth)[shown].mean() < 3
+    words = " ".join(f"{name}=car/{name}.png" for name in ("left", "back", "front", "right"))
+    main(f"rig stitch car {words} --size 160,160 --span 8 --center 1.4,0.5 --out b.png".split())
+    assert np.array_equal(read_image("b.png"), found)
+
+
+def test_stitch_takes_frames_and_views(folder, pictures):
+    for name, picture in pictures.items():
+        for k in range(2):
+            write(folder / "drive" / name / f"{k}.png", picture[:, :: 1 - 2 * k, :1].squeeze())
+    options = "--view=perspective --fov_deg=90 --yaw_deg=20 --size=40,60 --seam=wide --gain=true"
+    main(f"rig stitch car drive --distance 9 {options} --out out".split())
+    first, second = (np.array(Image.open(folder / "out" / f"{k}.png")) for k in range(2))
+    assert first.shape == (40, 60) and first.any() and np.abs(first - second.astype(int)).max() > 50
+
+
+def test_check_sees_what_is_wrong_and_says_what_would_help(folder, capsys):
+    means, said = {}, {}
+    for rig in RIGS:
+        main(f"rig check {rig} car".split())
+        said[rig] = capsys.readouterr().out
+        means[rig] = np.array([float(x) for x in re.findall(r"differ by ([\d.]+) of", said[rig])])
+    assert all(mean[-1] >= 2 * means["car"][-1] for rig, mean in means.items() if rig != "car")
+    assert "no small turn or move of one camera agrees clearly better" in said["car"]
+    assert "left: turned by 2° to the left, its pictures agree better" in said["yaw"]
+    assert "front: 5 cm lower, its pictures agree better" in said["height"]
