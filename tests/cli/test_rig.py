@@ -160,3 +160,89 @@ def test_check_sees_what_is_wrong_and_says_what_would_help(folder, capsys):
     assert "no small turn or move of one camera agrees clearly better" in said["car"]
     assert "left: turned by 2° to the left, its pictures agree better" in said["yaw"]
     assert "front: 5 cm lower, its pictures agree better" in said["height"]
+
+
+# -- fisheye pictures of a cube's faces -------------------------------------------------------
+
+
+def write_faces(folder, side=96, order="carla", kinds=("",), frame="", of="z", depth="npy"):
+    """The faces of the box: colours, or folders of `kinds`."""
+    for name, camera in Rig.cube(side, order).cameras.items():
+        distance, labels, _ = of_box(0, rays_of(camera, 1))
+        z = distance * (rays_of(camera, 1) @ camera.pose[:3, 2])
+        values = {
+            "depth": (z if of == "z" else distance).astype(np.float32),
+            "labels": labels.astype(np.uint8),
+        }
+        for kind in kinds:
+            file = folder / kind / name / frame if frame else folder / kind / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if kind != "depth":
+                picture = values.get(kind)
+                write(file.with_name(f"{file.name}.png"), shoot(camera, lambda *a: of_box(*a)[2], 4)
+                      if picture is None else picture)  # fmt: skip
+            elif depth == "npy":
+                np.save(f"{file}.npy", values[kind])
+            else:
+                cv2.imwrite(f"{file}.png", np.rint(values[kind] * 1000).astype(np.uint16))
+
+
+@pytest.fixture
+def faces(tmp_path, monkeypatch):
+    """A folder, with the calibration of a fisheye of 189°."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("darswin.views.rig._module.LACK", "no sampler yet")
+    save(TO, "fisheye.json")
+    return tmp_path / "faces"
+
+
+@pytest.mark.parametrize(
+    ("frame", "of", "depth", "unit"),
+    [("", "z", "npy", ""), ("0007", "distance", "png", "--depth_unit=0.001")],
+)
+def test_fisheye_is_what_the_lens_itself_would_see(faces, capsys, frame, of, depth, unit):
+    write_faces(faces, kinds=("colour", "labels", "depth"), frame=frame, of=of, depth=depth)
+    (faces / "classes.json").write_text('{"names": ["b", "f", "u", "d", "r", "l"]}')
+    main(f"rig fisheye faces --to fisheye.json --out new --depth_of {of} {unit}".split())
+    said = "new: 1 picture, 64 × 72 px (H × W), with labels and depth and lens.json\n"
+    assert capsys.readouterr().out == said
+    camera = Rig.single(TO).cameras["camera"]
+    (distance, labels, _), rays = of_box(0, rays_of(camera, 1)), rays_of(camera, 1)
+    shown = np.isfinite(rays).all(-1)
+    name = frame or "0000"
+    found, truth = read_image(f"new/images/{name}.png"), shoot(camera, lambda *a: of_box(*a)[2], 8)
+    inside = cv2.erode(shown.astype(np.uint8), np.ones((3, 3))) > 0
+    assert np.abs(found.astype(int) - truth)[inside].mean() < 1.5 and not found[~shown].any()
+    for task, target, nothing in (("segmentation", labels, 255), ("distance", distance, 0)):
+        scenes = open_scenes("new", "train", {"segmentation": "labels"}.get(task, task), holdout=0)
+        read = scenes.target(0)
+        assert (read[~shown] == nothing).all()
+        wrong = np.abs(read[shown] - target[shown]) > 0.01
+        assert wrong.mean() < (0.02 if task == "segmentation" else 0.005), task
+    assert torch.equal(load("new/lens.json").image_size, TO.image_size)
+
+
+def test_fisheye_takes_the_faces_of_opengl_and_another_size(faces, capsys):
+    write_faces(faces, order="opengl", side=48)
+    main("rig fisheye faces --to fisheye.json --out new --faces opengl --size 32,36".split())
+    assert capsys.readouterr().out == "new: 1 picture, 32 × 36 px (H × W), with lens.json\n"
+    camera = Rig.single(TO.resized((32, 36))).cameras["camera"]
+    truth = shoot(camera, lambda *a: of_box(*a)[2], 8)[8:-8, 8:-8]
+    assert np.abs(read_image("new/images/0000.png")[8:-8, 8:-8].astype(int) - truth).mean() < 2
+
+
+def test_exr_is_read_if_opencv_can(faces, capsys):
+    write_faces(faces, side=16, kinds=("colour", "depth"))
+    for name in CUBES["carla"]:
+        file, depth = faces / "depth" / f"{name}.exr", np.load(faces / "depth" / f"{name}.npy")
+        try:
+            cv2.imwrite(str(file), depth)
+        except cv2.error:
+            file.write_bytes(b"v/1\x01")
+        (faces / "depth" / f"{name}.npy").unlink()
+    command = "rig fisheye faces --to fisheye.json --out new".split()
+    if (faces / "depth" / "front.exr").stat().st_size > 4:
+        main(command)
+        assert cv2.imread("new/distance/0000.png", -1).any()
+    else:
+        assert "convert it to .npy" in ended(capsys, 2, lambda: main(command)).err
