@@ -228,8 +228,11 @@ class RigRemap:
         """
         values = []
         for frame, pixels in zip(in_order(frames, self.rig), self._seen.pixels, strict=True):
-            planes = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None].float()
-            values.append(read_at(planes, np.nan_to_num(pixels))[0].T.numpy())
+            images = frame
+            if isinstance(frame, np.ndarray):
+                images = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None]
+            read = read_at(images.detach().float(), np.nan_to_num(pixels))
+            values.append(read.flatten(0, 1).T.cpu().numpy())
         shown = self._seen.room >= 0
         pairs = {}
         for a, b in itertools.combinations(range(len(values)), 2):
@@ -250,7 +253,7 @@ class RigRemap:
         rows, goals = [np.ones(len(names))], [0.0]
         for (a, b), (_, (first, second)) in self.overlaps(frames).items():
             inside = np.ones(first.shape[:1], bool)
-            if in_order(frames, self.rig)[0].dtype == np.uint8:
+            if in_order(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
                 both = np.concatenate((first, second), 1)
                 inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
             sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
