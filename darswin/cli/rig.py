@@ -13,7 +13,7 @@ from darswin.cli.rig_fisheye import fisheye
 from darswin.cli.views import Look, Up
 from darswin.lens.files.reader import Coefficients
 from darswin.lens.rig import Camera, Rig
-from darswin.utils.parameters import check
+from darswin.utils.parameters import check, naming
 from darswin.utils.words import counted, in_px
 from darswin.views import GroundView, PixelView, RayView
 from darswin.views.registry import flat_views, view_class
@@ -75,7 +75,7 @@ def show(
 
 
 def stitch(
-    rig: str, pictures: Sequence[str], *, out: str, view: str | None = None,
+    rig: str, pictures: Sequence[str] = (), *, out: str, view: str | None = None,
     size: tuple[int, int] | None = None, span: float | None = None,
     center: tuple[float, float] | None = None, rise: float | None = None,
     fov_deg: float | None = None, yaw_deg: float = 0.0, pitch_deg: float = 0.0,
@@ -126,7 +126,7 @@ def stitch(
 
 
 def compare(
-    rig: str, pictures: Sequence[str], *, out: str | None = None, view: Place | None = None,
+    rig: str, pictures: Sequence[str] = (), *, out: str | None = None, view: Place | None = None,
     span: float | None = None, distance: float | None = None, up: Up | None = None,
     height: float | None = None, direction: Direction | None = None,
     coefficients: Coefficients | None = None,
@@ -194,8 +194,8 @@ def _view(
 ) -> PixelView:  # fmt: skip
     """A view of (H, W), or else of its usual shape with a longest side; ground: the arguments of
     `GroundView`, None for their defaults."""
+    lowest = min(camera.pose[:3, 3] @ rig.up for camera in rig.cameras.values())
     if name is None:
-        lowest = min(camera.pose[:3, 3] @ rig.up for camera in rig.cameras.values())
         name = "ground" if lowest > LOWEST else "equirectangular"
     check("view", name, name in VIEWS, f"one of {', '.join(VIEWS)}")
     size = size or ((side, side) if name == "ground" else (side // 2, side))
@@ -203,13 +203,16 @@ def _view(
     check("size", size, fits, f"at least 2,2 and at most {MOST_PIXELS} px in all")
     if name != "ground":
         for option, value in ground.items():
-            check(option, value, value is None, f"left out for a {name} view")
+            check(option, value, value is None, "left out unless the view is the ground")
         look = look._replace(view=name)
         look.check()
         return look.make(size, look.fov_deg)
     for option in ("fov_deg", "yaw_deg", "pitch_deg"):
         value = getattr(look, option)
         check(option, value, not value, "left out for the ground")
+    if lowest <= 0:
+        text = "a rig's origin is on the ground, and its cameras are above: give `height`, in metres"
+        raise naming(ValueError(text), "height")
     right, _, ahead = rig.middle @ rig.level
     usual = dict(span=SPAN, center=(ahead, -right))
     return GroundView(size, **usual | {k: v for k, v in ground.items() if v is not None})

@@ -81,6 +81,10 @@ def fisheye(
     for kind, frames in found.items():
         if lacking := frames.keys() ^ pictures.keys():
             raise FileNotFoundError(f"colour and {kind} do not both have the frame {min(lacking)}")
+    steps = [f for files in found.get("depth", {}).values() for f in files.values() if f.suffix == ".png"]
+    if steps and depth_unit is None:
+        text = f"missing `depth_unit`: the metres of a step of PNGs such as {steps[0]}"
+        raise naming(ValueError(text), "depth_unit")
     first = next(iter(next(iter(pictures.values())).values()))
     rig = Rig.cube(read_header(first).size[0], faces)
     remap, target = view.at(rig), claim_folder(out, RECORD)
@@ -101,8 +105,9 @@ def fisheye(
                 else:
                     replace_file(file, distance_png(remap.depth(maps, of=depth_of)))
             progress.done += 1
-    print(f"{out}: {counted(len(pictures), 'picture')}, {in_px(remap.view_size)}, "
-          f"with {' and '.join([*kinds[1:], LENS])}")  # fmt: skip
+    made = ", ".join(KINDS[kind].folder for kind in found)
+    size_and_lens = f"{in_px(remap.view_size)}; the lens is {target / LENS}"
+    print(f"{out}: {made} of {counted(len(pictures), 'frame')}, {size_and_lens}")
 
 
 def _depth(file: Path, unit: float | None) -> np.ndarray:
@@ -126,7 +131,4 @@ def _depth(file: Path, unit: float | None) -> np.ndarray:
     depth = depth[..., 0] if depth.ndim == 3 else depth
     if depth.dtype == np.uint8:
         raise ValueError(f"{file} has 8 bits: depths are PNGs of 16 bits, .npy or .exr")
-    if depth.dtype.kind in "iu" and unit is None:
-        text = f"missing `depth_unit`: the metres of a step of the whole numbers in {file}"
-        raise naming(ValueError(text), "depth_unit")
     return depth * float(unit or 1)

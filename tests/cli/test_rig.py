@@ -11,7 +11,8 @@ from helpers import ended
 from PIL import Image
 
 from darswin.cli.main import main
-from darswin.data import open_scenes
+from darswin.data.scenes import open_scenes
+from darswin.data.scenes.targets import TARGETS
 from darswin.lens import Equidistant, KannalaBrandt, load, save
 from darswin.lens.rig import CUBES, Rig
 from darswin.utils.image import read_image
@@ -104,7 +105,6 @@ def folder(tmp_path, monkeypatch, pictures):
     """The pictures of the car in `car/`, and its rigs by name."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Rig, "load", staticmethod(lambda path, **_: RIGS[path]), raising=False)
-    monkeypatch.setattr("darswin.views.rig._module.LACK", "no sampler yet")
     for name, picture in pictures.items():
         write(tmp_path / "car" / f"{name}.png", picture)
     return tmp_path
@@ -191,7 +191,6 @@ def write_faces(folder, side=96, order="carla", kinds=("",), frame="", of="z", d
 def faces(tmp_path, monkeypatch):
     """A folder, with the calibration of a fisheye of 189°."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("darswin.views.rig._module.LACK", "no sampler yet")
     save(TO, "fisheye.json")
     return tmp_path / "faces"
 
@@ -204,8 +203,8 @@ def test_fisheye_is_what_the_lens_itself_would_see(faces, capsys, frame, of, dep
     write_faces(faces, kinds=("colour", "labels", "depth"), frame=frame, of=of, depth=depth)
     (faces / "classes.json").write_text('{"names": ["b", "f", "u", "d", "r", "l"]}')
     main(f"rig fisheye faces --to fisheye.json --out new --depth_of {of} {unit}".split())
-    said = "new: 1 picture, 64 × 72 px (H × W), with labels and depth and lens.json\n"
-    assert capsys.readouterr().out == said
+    said = "new: images, labels, distance of 1 frame, 64 × 72 px (H × W); the lens is new/lens.json"
+    assert capsys.readouterr().out == f"{said}\n"
     camera = Rig.single(TO).cameras["camera"]
     (distance, labels, _), rays = of_box(0, rays_of(camera, 1)), rays_of(camera, 1)
     shown = np.isfinite(rays).all(-1)
@@ -214,18 +213,18 @@ def test_fisheye_is_what_the_lens_itself_would_see(faces, capsys, frame, of, dep
     inside = cv2.erode(shown.astype(np.uint8), np.ones((3, 3))) > 0
     assert np.abs(found.astype(int) - truth)[inside].mean() < 1.5 and not found[~shown].any()
     for task, target, nothing in (("segmentation", labels, 255), ("distance", distance, 0)):
-        scenes = open_scenes("new", "train", {"segmentation": "labels"}.get(task, task), holdout=0)
-        read = scenes.target(0)
+        _, read, lens = open_scenes("new", "train", TARGETS[task], holdout=0)[0]
+        assert type(lens) is Equidistant
         assert (read[~shown] == nothing).all()
-        wrong = np.abs(read[shown] - target[shown]) > 0.01
-        assert wrong.mean() < (0.02 if task == "segmentation" else 0.005), task
+        apart = np.abs(read[shown].astype(float) - target[shown])
+        assert np.quantile(apart, 0.97) < 0.006 and apart.max() < (0.2 if nothing == 0 else 6), task
     assert torch.equal(load("new/lens.json").image_size, TO.image_size)
 
 
 def test_fisheye_takes_the_faces_of_opengl_and_another_size(faces, capsys):
     write_faces(faces, order="opengl", side=48)
     main("rig fisheye faces --to fisheye.json --out new --faces opengl --size 32,36".split())
-    assert capsys.readouterr().out == "new: 1 picture, 32 × 36 px (H × W), with lens.json\n"
+    assert capsys.readouterr().out.startswith("new: images of 1 frame, 32 × 36 px (H × W);")
     camera = Rig.single(TO.resized((32, 36))).cameras["camera"]
     truth = shoot(camera, lambda *a: of_box(*a)[2], 8)[8:-8, 8:-8]
     assert np.abs(read_image("new/images/0000.png")[8:-8, 8:-8].astype(int) - truth).mean() < 2
