@@ -23,12 +23,11 @@ if TYPE_CHECKING:
     from darswin.views.rig import RigRemap
 
 Direction = Literal["camera_to_rig", "rig_to_camera"]
-Place = Literal["ground", "equirectangular"]
 VIEWS = ("ground", *(name for name in flat_views() if issubclass(view_class(name), RayView)))
 MOST_PIXELS = 2**24  # of a view
 SIDE, DRAWN, COMPARED = 800, 400, 160  # px, the longer side of a view: by default, in drawings …
 SPAN = 12.0  # m of the ground
-RECORD = "rig.json"
+RECORD, AHEAD = "rig.json", Look("", None, 0.0, 0.0, None)
 LOWEST = 0.1  # m above the ground: a rig whose cameras are all higher is shown there
 # What `compare` tries of one camera at a time.
 TURNS, MOVES, POINTS = (0.5, 1.0, 2.0), (2, 5), 4000  # degrees, cm, and places at most
@@ -36,9 +35,9 @@ CLEAR, LEAST = 0.2, 0.5  # the part of the difference, and units of 255, by whic
 
 
 def show(
-    rig: str, pictures: Sequence[str] = (), *, out: str = "rig.png", view: Place | None = None,
-    span: float | None = None, up: Up | None = None, height: float | None = None,
-    direction: Direction | None = None, coefficients: Coefficients | None = None,
+    rig: str, pictures: Sequence[str] = (), *, out: str = "rig.png", span: float | None = None,
+    up: Up | None = None, height: float | None = None, direction: Direction | None = None,
+    coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Draws the cameras of a rig from above and from the side, and how many see each place.
 
@@ -49,8 +48,6 @@ def show(
         pictures: a picture of each camera to draw too: see `darswin rig stitch`. Of frames, the
             first counts.
         out: the file to write; its ending names the format: png, jpg, webp, tif, pdf or svg.
-        view: whether the drawing is of the ground or of all directions. The default is the ground
-            if all cameras are above it.
     """
     from darswin.viz.plot import figure_format, save_figure
     from darswin.viz.rig import draw_rig
@@ -58,7 +55,7 @@ def show(
     figure_format(out)
     check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
-    remap = _view(cameras, view, span=span, side=DRAWN).at(cameras, seam="narrow")
+    remap = _view(cameras, side=DRAWN, span=span).at(cameras, seam="narrow")
     picture = remap(_first(cameras, pictures)) if pictures else None
     counts, what = remap.seen_by.sum(0), "sphere"
     weights = np.ones(counts.shape)
@@ -126,10 +123,9 @@ def stitch(
 
 
 def compare(
-    rig: str, pictures: Sequence[str] = (), *, out: str | None = None, view: Place | None = None,
-    span: float | None = None, distance: float | None = None, up: Up | None = None,
-    height: float | None = None, direction: Direction | None = None,
-    coefficients: Coefficients | None = None,
+    rig: str, pictures: Sequence[str] = (), *, out: str | None = None, span: float | None = None,
+    distance: float | None = None, up: Up | None = None, height: float | None = None,
+    direction: Direction | None = None, coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Measures how much the cameras of a rig disagree where they see the same places.
 
@@ -139,8 +135,6 @@ def compare(
     Args:
         pictures: a picture of each camera: see `darswin rig stitch`. Of frames, the first counts.
         out: the file for a drawing of the differences; its ending names the format, as for show.
-        view: whether the cameras are compared on the ground or in all directions. The default is
-            the ground if all cameras are above it.
     """
     from darswin.viz.plot import figure_format, save_figure
     from darswin.viz.rig import draw_differences
@@ -149,8 +143,7 @@ def compare(
         figure_format(out)
         check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
-    shown = _view(cameras, view, span=span, side=COMPARED)
-    remap = shown.at(cameras, distance=distance)
+    remap = _view(cameras, side=COMPARED, span=span).at(cameras, distance=distance)
     frames = _first(cameras, pictures)
     gains = dict(zip(cameras.names, remap.gains(frames), strict=True))
     levelled = {name: frame.astype(np.float32) * gains[name] for name, frame in frames.items()}
@@ -175,12 +168,10 @@ def open_rig(
     coefficients: Coefficients | None,
 ) -> Rig:  # fmt: skip
     """The rig of a file or a folder, or of `cube:SIDE`."""
+    given = dict(up=up, height=height, direction=direction, coefficients=coefficients)
     name, colon, side = rig.partition(":")
     if name != "cube" or not colon:
-        return Rig.load(
-            rig, up=up, height=height, direction=direction, coefficients=coefficients
-        )
-    given = dict(up=up, height=height, direction=direction, coefficients=coefficients)
+        return Rig.load(rig, **given)
     for option, value in given.items():
         check(option, value, value is None, "left out for a cube")
     if not side.isdecimal():
@@ -189,8 +180,8 @@ def open_rig(
 
 
 def _view(
-    rig: Rig, name: str | None, size: tuple[int, int] | None = None,
-    look: Look = Look("", None, 0.0, 0.0, None), side: int = SIDE, **ground: Any,
+    rig: Rig, name: str | None = None, size: tuple[int, int] | None = None,
+    look: Look = AHEAD, side: int = SIDE, **ground: Any,
 ) -> PixelView:  # fmt: skip
     """A view of (H, W), or else of its usual shape with a longest side; ground: the arguments of
     `GroundView`, None for their defaults."""
@@ -211,11 +202,11 @@ def _view(
         value = getattr(look, option)
         check(option, value, not value, "left out for the ground")
     if lowest <= 0:
-        text = "a rig's origin is on the ground, and its cameras are above: give `height`, in metres"
+        text = "the ground is at the rig's origin, below all cameras: give `height`, in metres"
         raise naming(ValueError(text), "height")
     right, _, ahead = rig.middle @ rig.level
-    usual = dict(span=SPAN, center=(ahead, -right))
-    return GroundView(size, **usual | {k: v for k, v in ground.items() if v is not None})
+    given: dict[str, Any] = dict(span=SPAN, center=(ahead, -right))
+    return GroundView(size, **given | {k: v for k, v in ground.items() if v is not None})
 
 
 def _first(rig: Rig, pictures: Sequence[str]) -> "dict[str, np.ndarray]":
@@ -227,8 +218,8 @@ def _first(rig: Rig, pictures: Sequence[str]) -> "dict[str, np.ndarray]":
 
 def _described(camera: Camera, rig: Rig) -> str:
     """The lens, place and direction of a camera in words."""
-    right, down, ahead = (rig.level.T @ camera.pose[:3, :3]).T
-    x, y, z = camera.pose[:3, 3] @ rig.level
+    right, _, ahead = (rig.level.T @ camera.pose[:3, :3]).T
+    x, y, z = np.round(camera.pose[:3, 3] @ rig.level, 2)
     yaw, pitch = math.atan2(ahead[0], ahead[2]), math.asin(max(-1.0, min(1.0, -ahead[1])))
     if abs(ahead[1]) > 1 - 1e-9:  # straight up or down, yaw is that of the picture's top
         yaw = math.atan2(-right[2], right[0])
@@ -236,7 +227,7 @@ def _described(camera: Camera, rig: Rig) -> str:
     roll = math.atan2(right @ np.cross(ahead, level), right @ level)
     angles = (f"{name} {math.degrees(angle) + 0:.1f}°" for name, angle in
               (("yaw", yaw), ("pitch", pitch), ("roll", roll)))  # fmt: skip
-    place = "{:.2f} m ahead, {:.2f} m to the left, {:.2f} m up".format(*np.round((z, -x, -y), 2) + 0)
+    place = f"{z + 0:.2f} m ahead, {-x + 0:.2f} m to the left, {-y + 0:.2f} m up"
     return f"{type(camera.lens).__name__}, {in_px(camera.size)}; {place}; {', '.join(angles)}"
 
 

@@ -59,9 +59,7 @@ def read_frames(rig: Rig, files: Files) -> dict[str, np.ndarray]:
     return check_sizes(rig, files, frames)
 
 
-def check_sizes(
-    rig: Rig, files: Files, frames: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+def check_sizes(rig: Rig, files: Files, frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The frames; ValueError unless each has the (H, W) of its camera."""
     for name, frame in frames.items():
         if frame.shape[:2] != rig[name].size:

@@ -5,7 +5,7 @@ import os
 from collections.abc import Collection
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -19,18 +19,11 @@ LENS, CLASSES, RECORD = "lens.json", "classes.json", "rig.json"
 FRAME = "0000"  # the name of the only one
 
 
-class Kind(NamedTuple):
-    """Where the pictures of a kind go, and the endings of its files, None for those of pictures."""
-
-    folder: str
-    endings: Collection[str] | None = None
-
-
-KINDS = {
-    "colour": Kind("images"),
-    "labels": Kind("labels", (".png",)),
-    "depth": Kind("distance", (".exr", ".npy", ".png")),
-}
+# The folder of a kind of pictures, and the endings of its files; None means those of pictures.
+KINDS: dict[str, tuple[str, Collection[str] | None]] = {
+    "colour": ("images", None), "labels": ("labels", (".png",)),
+    "depth": ("distance", (".exr", ".npy", ".png")),
+}  # fmt: skip
 
 
 def fisheye(
@@ -72,7 +65,7 @@ def fisheye(
     view, root = camera_view(to, size), Path(folder)
     kinds = [kind for kind in KINDS if (root / kind).is_dir()]
     found = {
-        kind: files_of([str(root / kind if kinds else root)], CUBES[faces], KINDS[kind].endings)
+        kind: files_of([str(root / kind if kinds else root)], CUBES[faces], KINDS[kind][1])
         for kind in kinds or ["colour"]
     }
     if "colour" not in found:
@@ -81,11 +74,11 @@ def fisheye(
     for kind, frames in found.items():
         if lacking := frames.keys() ^ pictures.keys():
             raise FileNotFoundError(f"colour and {kind} do not both have the frame {min(lacking)}")
-    steps = [f for files in found.get("depth", {}).values() for f in files.values() if f.suffix == ".png"]
-    if steps and depth_unit is None:
-        text = f"missing `depth_unit`: the metres of a step of PNGs such as {steps[0]}"
-        raise naming(ValueError(text), "depth_unit")
-    first = next(iter(next(iter(pictures.values())).values()))
+    first, *_ = (file for files in pictures.values() for file in files.values())
+    for file in (file for files in found.get("depth", {}).values() for file in files.values()):
+        if file.suffix == ".png" and depth_unit is None:
+            text = f"missing `depth_unit`: the metres of a step of PNGs such as {file}"
+            raise naming(ValueError(text), "depth_unit")
     rig = Rig.cube(read_header(first).size[0], faces)
     remap, target = view.at(rig), claim_folder(out, RECORD)
     save(view.lens, target / LENS)
@@ -94,7 +87,7 @@ def fisheye(
     with Progress("fisheye", len(pictures)) as progress:
         for frame in pictures:
             for kind, frames in found.items():
-                file, files = target / KINDS[kind].folder / f"{frame or FRAME}.png", frames[frame]
+                file, files = target / KINDS[kind][0] / f"{frame or FRAME}.png", frames[frame]
                 if kind == "colour":
                     write_image(file, remap(read_frames(rig, files)))
                     continue
@@ -105,7 +98,7 @@ def fisheye(
                 else:
                     replace_file(file, distance_png(remap.depth(maps, of=depth_of)))
             progress.done += 1
-    made = ", ".join(KINDS[kind].folder for kind in found)
+    made = ", ".join(KINDS[kind][0] for kind in found)
     size_and_lens = f"{in_px(remap.view_size)}; the lens is {target / LENS}"
     print(f"{out}: {made} of {counted(len(pictures), 'frame')}, {size_and_lens}")
 

@@ -34,9 +34,10 @@ def draw_rig(remap: RigRemap, picture: np.ndarray | None = None) -> Figure:
     """
     maps = ["counts"] if picture is None else ["counts", "picture"]
     is_ground = isinstance(remap.view, GroundView)
-    rows = [maps] if is_ground and len(maps) > 1 else [[name, name] for name in maps]
-    figure = page_figure(3.1 * (1 + len(rows)))
-    panels = figure.subplot_mosaic([["above", "side"], *rows])
+    rows = [["above", "side"]]
+    rows += [maps] if is_ground and len(maps) > 1 else [[name, name] for name in maps]
+    figure = page_figure(3.1 * len(rows))
+    panels = figure.subplot_mosaic(rows)  # type: ignore[arg-type]
     titles = {"above": "cameras, from above", "side": "from the right",
               "counts": "number of cameras", "picture": "stitched"}  # fmt: skip
     _draw_cameras(panels["above"], remap.rig, ABOVE)
@@ -77,9 +78,11 @@ def draw_differences(remap: RigRemap, apart: np.ndarray) -> Figure:
     return figure
 
 
-def _colours(rig: Rig) -> dict[str, np.ndarray]:
+def _colours(rig: Rig) -> dict[str, str]:
     """A colour of each camera."""
-    return dict(zip(rig.names, np.array(palette(len(rig))) / 255, strict=True))
+    return {
+        name: "#" + bytes(c).hex() for name, c in zip(rig.names, palette(len(rig)), strict=True)
+    }
 
 
 def _lines(rig: Rig) -> list[Line2D]:
@@ -89,7 +92,7 @@ def _lines(rig: Rig) -> list[Line2D]:
 
 def _draw_cameras(axes: Axes, rig: Rig, paper: np.ndarray) -> None:
     """Draws the places, the axes and the fields of view of cameras, projected to `paper`."""
-    length = 0.6 * max(rig.spread, rig.middle @ rig.up / 2, LEAST)
+    length = 0.6 * max(rig.spread, float(rig.middle @ rig.up) / 2, LEAST)
     axes.plot(0, 0, "+", color="0.4", ms=10)  # the origin
     for name, colour in _colours(rig).items():
         camera = rig[name]
@@ -97,7 +100,7 @@ def _draw_cameras(axes: Axes, rig: Rig, paper: np.ndarray) -> None:
         ends = np.concatenate((np.zeros((1, 3)), seen, [[0, 0, 1]])) * length
         points = (ends @ camera.pose[:3, :3].T + camera.pose[:3, 3]) @ rig.level @ paper
         outline = cv2.convexHull(points.astype(np.float32))[:, 0]
-        axes.fill(*outline.T, fc=(*colour, 0.15), ec=colour, lw=1)
+        axes.fill(*outline.T, fc=(colour, 0.15), ec=colour, lw=1)
         axes.plot(*points[[0, -1]].T, color=colour, lw=2)
         axes.plot(*points[0], "o", color=colour, ms=5)
     axes.set_aspect("equal", "datalim")
@@ -133,5 +136,5 @@ def _draw_map(
         axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 3, 5, 6, 10]))
     for seen, colour in zip(remap.seen_by, _colours(remap.rig).values(), strict=True):
         if seen.any() and not seen.all():
-            axes.contour(seen, [0.5], colors=[colour], extent=extent, origin="upper", linewidths=1.2)
+            axes.contour(seen, [0.5], colors=[colour], extent=extent, origin="upper")
     return drawn

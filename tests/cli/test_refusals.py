@@ -126,10 +126,8 @@ REFUSED = {
         turn cube:8 => invalid choice: 'turn'
         show cube:big => a cube is cube:SIDE, with the side of its pictures in px, got cube:big
         show cube:8 --height 2 => --height must be left out for a cube, got 2.0
-        show cube:8 --view sky => --view must be one of ground, equirectangular, got sky
-        show cube:8 --view ground => cameras are above: give --height, in metres
         show cube:8 --out rig.gif => must end in one of \.png
-        show cube:8 in => ^darswin: in/p.png is of no camera: they are front, right, back, left, up, d
+        show cube:8 in => ^darswin: in/p.png is of no camera: they are front, right, ba
         show cube:8 in cube => in must be NAME=PATH, or a folder that is given alone
         show cube:8 p.png => p.png must be a folder with a picture of each camera
         show cube:8 gone => no file or folder gone
@@ -143,6 +141,7 @@ REFUSED = {
         stitch cube:8 cube --out cube/up.png => --out cube/up.png would replace
     """,
     "rig stitch cube:8 cube --out new.png": r"""
+        --view ground => below all cameras: give --height, in metres
         --view square => --view must be one of ground, cylindrical, .* got square
         --span 3 => --span must be left out unless the view is the ground, got 3.0
         --size 0,4 => --size must be at least 2,2

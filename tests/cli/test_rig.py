@@ -16,7 +16,6 @@ from darswin.data.scenes.targets import TARGETS
 from darswin.lens import Equidistant, KannalaBrandt, load, save
 from darswin.lens.rig import CUBES, Rig
 from darswin.utils.image import read_image
-from darswin.views import GroundView
 
 SIZE = (240, 320)
 FISHEYE = KannalaBrandt(86.0, [0.01, -0.004, 0.001, 0.0], 1.66, image_size=SIZE)
@@ -46,7 +45,8 @@ def car(lens=FISHEYE, **changed):
 def ground(x, y):
     """The colours of the ground at x ahead and y to the left, m."""
     turns = ((1.7, 0.6), (-0.9, 1.5), (0.5, -1.9))
-    planes = [60 * np.sin(2 * (a * x + b * y)) + 40 * np.sin(3.1 * (b * x - a * y)) for a, b in turns]
+    waves = ((a * x + b * y, b * x - a * y) for a, b in turns)
+    planes = [60 * np.sin(2 * u) + 40 * np.sin(3.1 * v) for u, v in waves]
     return 128 + np.exp(-np.hypot(x, y) / 8)[..., None] * np.stack(planes, -1)
 
 
@@ -82,6 +82,10 @@ def shoot(camera, scene=of_ground, fine=2):
     return np.rint(picture).clip(0, 255).astype(np.uint8)
 
 
+def run(command):
+    main(["rig", *command.split()])
+
+
 def write(path, picture):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).save(path)
@@ -111,10 +115,10 @@ def folder(tmp_path, monkeypatch, pictures):
 
 
 def test_show_lists_and_draws_the_cameras(folder, capsys):
-    main("rig show car car --out car.png".split())
+    run("show car car --out car.png")
     said = capsys.readouterr().out.splitlines()
-    assert "left: KannalaBrandt, 240 × 320 px (H × W); 2.00 m ahead, 1.00 m to the left, 1.00 m up; " \
-           "yaw -90.0°, pitch -40.0°, roll 0.0°" in said  # fmt: skip
+    place = "2.00 m ahead, 1.00 m to the left, 1.00 m up; yaw -90.0°, pitch -40.0°, roll 0.0°"
+    assert f"left: KannalaBrandt, 240 × 320 px (H × W); {place}" in said
     y, x = np.mgrid[-6:6:100j, -6:6:100j]
     _, seen = RIGS["car"].project(np.stack((x + 1.675, y, 0 * x), -1))
     shares = re.findall(r"([\d.]+)%", said[4])
@@ -122,21 +126,21 @@ def test_show_lists_and_draws_the_cameras(folder, capsys):
     for share, found in zip(shares, (counts == 1, counts > 1, counts == 0), strict=True):
         assert abs(float(share) - 100 * found.mean()) < 0.6
     assert said[5] == "car.png" and Image.open("car.png").size[0] == 1200
-    main("rig show cube:16 --out cube.pdf".split())
+    run("show cube:16 --out cube.pdf")
     said = capsys.readouterr().out
     assert "down: Perspective" in said and "yaw 0.0°, pitch -90.0°, roll 0.0°" in said
     assert "of the sphere, 100.0% are seen by one camera, 0.0% by more and 0.0% by none" in said
 
 
 def test_stitch_shows_the_ground(folder, capsys):
-    main("rig stitch car car --size 160,160 --span 8 --center 1.4,0.5 --out new.png".split())
+    run("stitch car car --size 160,160 --span 8 --center 1.4,0.5 --out new.png")
     assert capsys.readouterr().out == "new.png: 1 picture, 160 × 160 px (H × W)\n"
     y, x = np.mgrid[:160, :160]
     truth, found = ground(5.4 - (y + 0.5) / 20, 4.5 - (x + 0.5) / 20), read_image("new.png")
     shown = found.any(-1)
     assert shown.mean() > 0.98 and np.abs(found - truth)[shown].mean() < 3
     words = " ".join(f"{name}=car/{name}.png" for name in ("left", "back", "front", "right"))
-    main(f"rig stitch car {words} --size 160,160 --span 8 --center 1.4,0.5 --out b.png".split())
+    run(f"stitch car {words} --size 160,160 --span 8 --center 1.4,0.5 --out b.png")
     assert np.array_equal(read_image("b.png"), found)
 
 
@@ -145,7 +149,7 @@ def test_stitch_takes_frames_and_views(folder, pictures):
         for k in range(2):
             write(folder / "drive" / name / f"{k}.png", picture[:, :: 1 - 2 * k, :1].squeeze())
     options = "--view=perspective --fov_deg=90 --yaw_deg=20 --size=40,60 --seam=wide --gain=true"
-    main(f"rig stitch car drive --distance 9 {options} --out out".split())
+    run(f"stitch car drive --distance 9 {options} --out out")
     first, second = (np.array(Image.open(folder / "out" / f"{k}.png")) for k in range(2))
     assert first.shape == (40, 60) and first.any() and np.abs(first - second.astype(int)).max() > 50
 
@@ -153,7 +157,7 @@ def test_stitch_takes_frames_and_views(folder, pictures):
 def test_check_sees_what_is_wrong_and_says_what_would_help(folder, capsys):
     means, said = {}, {}
     for rig in RIGS:
-        main(f"rig check {rig} car".split())
+        run(f"check {rig} car")
         said[rig] = capsys.readouterr().out
         means[rig] = np.array([float(x) for x in re.findall(r"differ by ([\d.]+) of", said[rig])])
     assert all(mean[-1] >= 2 * means["car"][-1] for rig, mean in means.items() if rig != "car")
@@ -202,7 +206,7 @@ def faces(tmp_path, monkeypatch):
 def test_fisheye_is_what_the_lens_itself_would_see(faces, capsys, frame, of, depth, unit):
     write_faces(faces, kinds=("colour", "labels", "depth"), frame=frame, of=of, depth=depth)
     (faces / "classes.json").write_text('{"names": ["b", "f", "u", "d", "r", "l"]}')
-    main(f"rig fisheye faces --to fisheye.json --out new --depth_of {of} {unit}".split())
+    run(f"fisheye faces --to fisheye.json --out new --depth_of {of} {unit}")
     said = "new: images, labels, distance of 1 frame, 64 × 72 px (H × W); the lens is new/lens.json"
     assert capsys.readouterr().out == f"{said}\n"
     camera = Rig.single(TO).cameras["camera"]
@@ -223,7 +227,7 @@ def test_fisheye_is_what_the_lens_itself_would_see(faces, capsys, frame, of, dep
 
 def test_fisheye_takes_the_faces_of_opengl_and_another_size(faces, capsys):
     write_faces(faces, order="opengl", side=48)
-    main("rig fisheye faces --to fisheye.json --out new --faces opengl --size 32,36".split())
+    run("fisheye faces --to fisheye.json --out new --faces opengl --size 32,36")
     assert capsys.readouterr().out.startswith("new: images of 1 frame, 32 × 36 px (H × W);")
     camera = Rig.single(TO.resized((32, 36))).cameras["camera"]
     truth = shoot(camera, lambda *a: of_box(*a)[2], 8)[8:-8, 8:-8]
@@ -239,9 +243,9 @@ def test_exr_is_read_if_opencv_can(faces, capsys):
         except cv2.error:
             file.write_bytes(b"v/1\x01")
         (faces / "depth" / f"{name}.npy").unlink()
-    command = "rig fisheye faces --to fisheye.json --out new".split()
+    command = "fisheye faces --to fisheye.json --out new"
     if (faces / "depth" / "front.exr").stat().st_size > 4:
-        main(command)
+        run(command)
         assert cv2.imread("new/distance/0000.png", -1).any()
     else:
-        assert "convert it to .npy" in ended(capsys, 2, lambda: main(command)).err
+        assert "convert it to .npy" in ended(capsys, 2, run, command).err
