@@ -36,7 +36,7 @@ CLEAR, LEAST = 0.2, 0.5  # the part of the difference, and units of 255, by whic
 
 def show(
     rig: str, pictures: Sequence[str] = (), *, out: str = "rig.png", span: float | None = None,
-    up: Up | None = None, height: float | None = None, direction: Direction | None = None,
+    up: Up | None = None, height: float = 0.0, direction: Direction | None = None,
     coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Draws the cameras of a rig from above and from the side, and how many see each place.
@@ -77,7 +77,7 @@ def stitch(
     center: tuple[float, float] | None = None, rise: float | None = None,
     fov_deg: float | None = None, yaw_deg: float = 0.0, pitch_deg: float = 0.0,
     seam: Seam = "narrow", gain: bool = False, distance: float | None = None, up: Up | None = None,
-    height: float | None = None, direction: Direction | None = None,
+    height: float = 0.0, direction: Direction | None = None,
     coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Writes one picture of what all cameras of a rig see: the ground from above, or a panorama.
@@ -89,7 +89,14 @@ def stitch(
         view: ground, or a map of directions such as equirectangular or perspective. The default is
             the ground if all cameras are above it, and else equirectangular.
         size: height and width of the picture, px. The default is 800,800 for the ground, and else
-            512,1024.
+            400,800.
+        center: the middle of the ground that is shown, in metres ahead and to the left of the rig's
+            origin. The default is below the middle of the cameras.
+        rise: turns the ground into a bowl, e.g. 0.15: the height is this · (r - 5)² at r > 5 m.
+        fov_deg: the horizontal field of view of a view of directions, in degrees. The default is
+            360, but 340 for a stereographic view and 100 for a perspective one.
+        yaw_deg: the angle that a view of directions looks to the right of ahead, in degrees.
+        pitch_deg: the angle that it looks up, in degrees.
         seam: hard: each place from one camera; narrow: mixed in the middle of an overlap; wide:
             mixed in all of it.
         gain: whether each camera gets a factor that makes all equally bright.
@@ -124,7 +131,7 @@ def stitch(
 
 def compare(
     rig: str, pictures: Sequence[str] = (), *, out: str | None = None, span: float | None = None,
-    distance: float | None = None, up: Up | None = None, height: float | None = None,
+    distance: float | None = None, up: Up | None = None, height: float = 0.0,
     direction: Direction | None = None, coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
     """Measures how much the cameras of a rig disagree where they see the same places.
@@ -164,7 +171,7 @@ def compare(
 
 
 def open_rig(
-    rig: str, up: Up | None, height: float | None, direction: Direction | None,
+    rig: str, up: Up | None, height: float, direction: Direction | None,
     coefficients: Coefficients | None,
 ) -> Rig:  # fmt: skip
     """The rig of a file or a folder, or of `cube:SIDE`."""
@@ -173,7 +180,7 @@ def open_rig(
     if name != "cube" or not colon:
         return Rig.load(rig, **given)
     for option, value in given.items():
-        check(option, value, value is None, "left out for a cube")
+        check(option, value, not value, "left out for a cube")
     if not side.isdecimal():
         raise ValueError(f"a cube is cube:SIDE, with the side of its pictures in px, got {rig}")
     return Rig.cube(int(side))

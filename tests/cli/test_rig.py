@@ -234,7 +234,8 @@ def test_fisheye_takes_the_faces_of_opengl_and_another_size(faces, capsys):
     assert np.abs(read_image("new/images/0000.png")[8:-8, 8:-8].astype(int) - truth).mean() < 2
 
 
-def test_exr_is_read_if_opencv_can(faces, capsys):
+def test_exr_is_read_if_opencv_can(faces, capsys, monkeypatch):
+    monkeypatch.setenv("OPENCV_IO_ENABLE_OPENEXR", "1")
     write_faces(faces, side=16, kinds=("colour", "depth"))
     for name in CUBES["carla"]:
         file, depth = faces / "depth" / f"{name}.exr", np.load(faces / "depth" / f"{name}.npy")
@@ -246,6 +247,6 @@ def test_exr_is_read_if_opencv_can(faces, capsys):
     command = "fisheye faces --to fisheye.json --out new"
     if (faces / "depth" / "front.exr").stat().st_size > 4:
         run(command)
-        assert cv2.imread("new/distance/0000.png", -1).any()
+        assert np.median(cv2.imread("new/distance/0000.png", -1)) > 256
     else:
         assert "convert it to .npy" in ended(capsys, 2, run, command).err
