@@ -137,7 +137,8 @@ def compare(
     """Measures how much the cameras of a rig disagree where they see the same places.
 
     Wrong poses, heights and lenses show, and also things that stand on the ground. It also tries
-    small turns and moves of each camera alone, and says which would agree clearly better.
+    small turns and moves of each camera alone, and of the rig's height, and names the best one if
+    the pictures then agree clearly better.
 
     Args:
         pictures: a picture of each camera: see `darswin rig stitch`. Of frames, the first counts.
@@ -163,8 +164,7 @@ def compare(
     for name, gain in gains.items():
         if abs(gain - 1) >= 0.01:
             print(f"{name} is too {'dark' if gain > 1 else 'bright'}: its factor is {gain:.2f}")
-    better = _better(remap, levelled)
-    print(*(better or ["no small turn or move of one camera agrees clearly better"]), sep="\n")
+    print(_better(remap, levelled))
     if out is not None:
         save_figure(draw_differences(remap, apart), out)
         print(out)
@@ -238,60 +238,61 @@ def _described(camera: Camera, rig: Rig) -> str:
     return f"{type(camera.lens).__name__}, {in_px(camera.size)}; {place}; {', '.join(angles)}"
 
 
-def _better(remap: "RigRemap", frames: "dict[str, np.ndarray]") -> list[str]:
-    """The small changes of one camera by which frames (H, W, C) float32 agree clearly better, best
-    first."""
-    rig, found = remap.rig, []
+def _better(remap: "RigRemap", frames: "dict[str, np.ndarray]") -> str:
+    """The small change by which frames (H, W, C) float32 agree best, if that is clear."""
+    rig, seen_now = remap.rig, remap.seen_by
     images = [torch.from_numpy(frame).movedim(2, 0)[None].contiguous() for frame in frames.values()]
 
-    def apart(number: int, camera: Camera, points: np.ndarray) -> float:
-        """The mean difference of a camera from others at points of the view; ∞ if most are lost."""
-        changed = rig.cameras | {rig.names[number]: camera}
-        seen = see(remap.view, Rig(changed, up=rig.up, forward=rig.forward), remap.distance, points)
-        values = [
-            read_at(image, np.nan_to_num(at))[0].numpy()
-            for image, at in zip(images, seen.pixels, strict=True)
-        ]
-        both = (seen.room >= 0) & (seen.room[number] >= 0)
-        both[number] = False
-        if both.any(0).mean() < 0.5:
-            return math.inf
-        return float(np.abs(values - values[number]).mean(1)[both].mean())
+    def apart(cameras: dict[str, Camera], numbers: list[int], points: np.ndarray) -> float:
+        """The mean difference of some cameras from others at points; ∞ if most are lost."""
+        changed = Rig(cameras, up=rig.up, forward=rig.forward)
+        seen, parts = see(remap.view, changed, remap.distance, points), []
+        reads = zip(images, np.nan_to_num(seen.pixels), strict=True)
+        values = np.stack([read_at(image, pixels)[0].numpy() for image, pixels in reads])
+        shown = seen.room >= 0
+        for number in numbers:
+            both = shown & shown[number]
+            both[number] = False
+            parts.append(np.abs(values - values[number]).mean(1)[both])
+        lost = (shown[numbers].any(0) & (shown.sum(0) > 1)).mean() < 0.5
+        return math.inf if lost else float(np.concatenate(parts).mean())
 
-    for number, (name, camera) in enumerate(rig.cameras.items()):
-        shared = remap.seen_by[number] & (remap.seen_by.sum(0) > 1)
-        points = np.argwhere(shared)[:, ::-1].astype(np.float64)
+    best, text = 1 - CLEAR, "no small turn or move agrees clearly better"
+    for names in (*((name,) for name in rig.names), rig.names):
+        numbers = [rig.names.index(name) for name in names]
+        points = np.argwhere(seen_now[numbers].any(0) & (seen_now.sum(0) > 1))[:, ::-1]
         if not len(points):
             continue
-        points = points[:: -(-len(points) // POINTS)]
-        now = apart(number, camera, points)
-        changes = ((apart(number, c, points), how) for how, c in _changes(camera, remap))
-        best, how = min(changes)
-        if best <= min((1 - CLEAR) * now, now - LEAST):
-            text = f"{name}: {how}, its pictures agree better ({now:.1f} → {best:.1f})"
-            found.append((best / now, text))
-    return [text for _, text in sorted(found)]
+        points = points[:: -(-len(points) // POINTS)].astype(np.float64)
+        now = apart(rig.cameras, numbers, points)
+        for how, change in _changes(remap, names):
+            moved = {name: rig[name]._replace(pose=change @ rig[name].pose) for name in names}
+            then = apart(rig.cameras | moved, numbers, points)
+            if then <= min(best * now, now - LEAST):
+                who, best = names[0] if len(names) == 1 else "all cameras", then / now
+                text = f"{who}: {how}, pictures agree better ({now:.1f} → {then:.1f})"
+    return text
 
 
-def _changes(camera: Camera, remap: "RigRemap") -> Iterator[tuple[str, Camera]]:
-    """Small turns of a camera, and moves along the vertical if they matter, with their names."""
+def _changes(remap: "RigRemap", names: Sequence[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Small turns of a camera, and moves along the vertical if they matter, in words and as (4, 4)
+    for points of the rig's frame; for several cameras only moves."""
     import cv2
 
-    pose, up = camera.pose, np.array(remap.rig.up)
+    pose, up = remap.rig[names[0]].pose, np.array(remap.rig.up)
     axes = ((-up, "to the right", "to the left"), (pose[:3, 0], "up", "down"),
             (pose[:3, 2], "clockwise", "counterclockwise"))  # fmt: skip
-    for axis, forth, back in axes:
+    for axis, forth, back in axes if len(names) == 1 else ():
         for degrees in (sign * turn for turn in TURNS for sign in (1, -1)):
-            turned = pose.copy()
-            turned[:3, :3] = cv2.Rodrigues(math.radians(degrees) * axis)[0] @ pose[:3, :3]
-            words = f"turned by {abs(degrees):g}° {forth if degrees > 0 else back}"
-            yield words, camera._replace(pose=turned)
+            turn = np.eye(4)
+            turn[:3, :3] = cv2.Rodrigues(math.radians(degrees) * axis)[0]
+            turn[:3, 3] = pose[:3, 3] - turn[:3, :3] @ pose[:3, 3]
+            yield f"turned by {abs(degrees):g}° {forth if degrees > 0 else back}", turn
     if remap.view.is_surface or remap.distance is not None:
-        for move in (sign * move for move in MOVES for sign in (1, -1)):
-            moved = pose.copy()
-            moved[:3, 3] += move / 100 * up
-            words = f"{abs(move)} cm {'higher' if move > 0 else 'lower'}"
-            yield words, camera._replace(pose=moved)
+        for centimetres in (sign * move for move in MOVES for sign in (1, -1)):
+            move = np.eye(4)
+            move[:3, 3] = centimetres / 100 * up
+            yield f"{abs(centimetres)} cm {'higher' if centimetres > 0 else 'lower'}", move
 
 
 COMMANDS = {"show": show, "stitch": stitch, "check": compare, "fisheye": fisheye}
