@@ -163,7 +163,7 @@ def compare(
     print(f"in all overlaps, cameras differ by {np.nanmean(apart):.1f} of 255")
     for name, gain in gains.items():
         if abs(gain - 1) >= 0.01:
-            print(f"{name} is too {'dark' if gain > 1 else 'bright'}: its factor is {gain:.2f}")
+            print(f"{name} is {'darker' if gain > 1 else 'brighter'}: its factor is {gain:.2f}")
     print(_better(remap, levelled))
     if out is not None:
         save_figure(draw_differences(remap, apart), out)

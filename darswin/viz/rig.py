@@ -66,12 +66,13 @@ def draw_rig(remap: RigRemap, picture: np.ndarray | None = None) -> Figure:
 
 def draw_differences(remap: RigRemap, apart: np.ndarray) -> Figure:
     """Draws how much cameras differ where they overlap, as `RigRemap.disagreement` returns it."""
-    figure = page_figure(4.6 if isinstance(remap.view, GroundView) else 3.6)
+    figure = page_figure(6.0 if isinstance(remap.view, GroundView) else 4.2)
     axes = figure.add_subplot()
     missing = np.isnan(apart)
     drawn = _draw_map(axes, remap, np.ma.masked_array(apart, missing), missing, cmap="magma",
                       vmin=0, vmax=np.nanquantile(apart, 0.99))  # fmt: skip
-    figure.colorbar(drawn, ax=axes, label="largest difference, of 255", extend="max")
+    label = "largest difference of two cameras, of 255"
+    figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.7, label=label, extend="max")
     mean = np.nanmean(apart)
     axes.set_title(f"where cameras overlap, {mean:.1f} of 255 in the mean", fontsize=TEXT)
     add_legend(figure, [*_lines(remap.rig), Patch(**HATCH, label="fewer than 2 cameras")])
