@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +40,9 @@ _RIGS = (
 )
 
 Vector = Sequence[float]
+# The pose of each camera, up if the file says it, and whether the frame is that of a camera.
+Read = tuple[list[np.ndarray], Vector | None, bool]
+Parts = tuple[Lens, Size, np.ndarray]
 
 
 class Found(NamedTuple):
@@ -49,7 +53,7 @@ class Found(NamedTuple):
     files do not say. in_camera: True if that is the frame of a camera.
     """
 
-    cameras: dict[str, tuple[Lens, Size, np.ndarray]]
+    cameras: dict[str, Parts]
     up: Vector | None = None
     forward: Vector | None = None
     in_camera: bool = False
@@ -95,20 +99,15 @@ class Reader(NamedTuple):
         if isinstance(content, Mapping) and (names := _with_matrix(content)):
             return self._matrices(path, Fields(content), names)
         file = Calibration(text, os.fspath(path), self.coefficients)
-        kind, up, in_camera = file.format.name, None, False
-        if kind == "Kalibr":
-            poses, in_camera = _kalibr(file)
-        elif kind == "OpenCV multi-view":
-            poses, in_camera = _multi_view(file), True
-        elif kind == "WoodScape":
-            poses, up = {file.names[0]: _woodscape(file)}, (0.0, 0.0, 1.0)
-        else:
-            raise ValueError(f"it is a {kind} file, which has no poses: {_RIGS}")
+        read = _POSES.get(file.format.name)
+        if read is None or isinstance(file.fields, list):
+            raise ValueError(f"{file.what}: it has no poses: {_RIGS}")
+        poses, up, in_camera = read(file.fields, file.names)
         self._goes(DIRECTIONS[0])
         lenses = file.lenses(image_size=self.image_size, dtype=torch.float64)
-        cameras = {
-            path.stem if file.names == ["camera"] else name: (lens, None, poses[name])
-            for name, lens in lenses.items()
+        cameras: dict[str, Parts] = {
+            path.stem if name == "camera" else name: (lens, None, pose)
+            for (name, lens), pose in zip(lenses.items(), poses, strict=True)
         }
         return Found(cameras, up, None, in_camera)
 
@@ -130,20 +129,20 @@ class Reader(NamedTuple):
     def _matrices(self, path: Path, file: Fields, names: list[str]) -> Found:
         """Our own JSON; and any cameras that `load` reads, each with its matrix."""
         said = file.one_of("direction", DIRECTIONS) if "direction" in file else None
-        goes, cameras = self._goes(said), {}
+        goes, cameras = self._goes(said), dict[str, Parts]()
         inside = file.section("cameras") if "cameras" in file else file
         for name in names:
             camera = inside.section(name) if name else file
             key = next((key for key in MATRIX if key in camera), MATRIX[0])
             pose = _matrix(camera, key)
             is_own = "lens" in camera
-            rest = camera.section("lens").entries if is_own else dict(camera.entries)
-            rest.pop(key, None)
+            lens = camera.section("lens").entries if is_own else camera.entries
+            rest = {k: v for k, v in lens.items() if k != key}
             reader = self._replace(image_size=None) if is_own else self
-            lens = reader._lens(json.dumps(rest), name or path.stem)
             size = camera.sides("size") if is_own and "size" in camera else None
             pose = pose if goes == DIRECTIONS[0] else inverse(pose)
-            cameras[name or path.stem] = lens, size, pose
+            name = name or path.stem
+            cameras[name] = reader._lens(json.dumps(rest), name), size, pose
         up, forward = (file.numbers(k, (3,)) if k in file else None for k in ("up", "forward"))
         return Found(cameras, up, forward)
 
@@ -155,7 +154,7 @@ class Reader(NamedTuple):
         entries = rigs[0].sections("cameras")
         named = _by_name((entry.text("image_prefix").strip("/"), entry) for entry in entries)
         lenses = self._reconstructed([*named])
-        cameras, reference = {}, []
+        cameras, reference = dict[str, Parts](), []
         for name, entry in named.items():
             pose = np.eye(4)
             if "ref_sensor" in entry and to_flag(entry.entries["ref_sensor"], "ref_sensor"):
@@ -198,7 +197,7 @@ class Reader(NamedTuple):
 
     def _kitti360(self, folder: Path) -> Found:
         self._goes(DIRECTIONS[0])
-        content, cameras = parse(decoded(read_bytes(folder / KITTI))), {}
+        content, cameras = parse(decoded(read_bytes(folder / KITTI))), dict[str, Parts]()
         if not isinstance(content, Mapping):
             raise ValueError(f"{KITTI} must have lines of a camera, a colon and 12 numbers")
         for path in sorted(folder.glob("image_*.yaml")):
@@ -230,11 +229,13 @@ def write(path: str | os.PathLike, cameras: Mapping[str, Any], up: Vector, forwa
         }
         head = {"about": _ABOUT, "direction": DIRECTIONS[0], "up": [*up], "forward": [*forward]}
         text = json.dumps(head | {"cameras": written}, indent=2, allow_nan=False) + "\n"
+        # Each list of numbers gets a line.
+        text = re.sub(r"\[\n[^][{}]*\]", lambda numbers: " ".join(numbers[0].split()), text)
     elif suffix in (".yaml", ".yml"):
         written, before = {}, None
         for i, (name, (lens, size, pose)) in enumerate(cameras.items()):
             try:
-                text = KALIBR.write(lens.replace(image_size=size), suffix)
+                text = KALIBR.write(lens.replace(image_size=torch.tensor([size])), suffix)
             except ValueError as error:
                 raise ValueError(f"camera {name}: {error}") from error
             warn_of_rays_beyond(lens, path, "kalibr")
@@ -248,14 +249,14 @@ def write(path: str | os.PathLike, cameras: Mapping[str, Any], up: Vector, forwa
     replace_file(path, text)
 
 
-def _kalibr(file: Calibration) -> tuple[dict[str, np.ndarray], bool]:
-    """The poses, and whether they are in the frame of cam0. T_cn_cnm1 takes points of the previous
-    camera's frame to this one's, T_cam_imu those of the IMU's; open_vins' T_imu_cam goes back."""
-    entries, names = _entries_of(file).entries, sorted(file.names, key=lambda name: (len(name), name))
-    cameras = {name: Fields(entries.get(name, entries), f"{name}.") for name in names}
+def _kalibr(file: Fields, names: list[str]) -> Read:
+    """T_cn_cnm1 takes points of the previous camera's frame to this one's, T_cam_imu those of the
+    IMU's; open_vins' T_imu_cam goes back."""
     poses, pose = {}, np.eye(4)
+    cameras = {name: Fields(file.entries.get(name, file.entries), f"{name}.") for name in names}
     in_camera = any("T_cn_cnm1" in camera for camera in cameras.values())
-    for i, (name, camera) in enumerate(cameras.items()):
+    for i, name in enumerate(sorted(names, key=lambda name: (len(name), name))):
+        camera = cameras[name]
         if in_camera and name != f"cam{i}":
             raise ValueError(f"the chain is broken: it has {short(name)}, but no cam{i}")
         if in_camera:
@@ -264,37 +265,41 @@ def _kalibr(file: Calibration) -> tuple[dict[str, np.ndarray], bool]:
             pose = _matrix(camera, "T_imu_cam")
         elif "T_cam_imu" in camera:
             pose = inverse(_matrix(camera, "T_cam_imu"))
-        elif len(cameras) > 1:
+        elif len(names) > 1:
             raise ValueError(f"{name} has no pose: T_cn_cnm1 (of all but cam0), or T_cam_imu")
-        else:  # one camera is a rig without poses
+        else:  # the only one
             in_camera = True
         poses[name] = pose
-    return poses, in_camera
+    return [poses[name] for name in names], None, in_camera
 
 
-def _multi_view(file: Calibration) -> dict[str, np.ndarray]:
+def _multi_view(file: Fields, names: list[str]) -> Read:
     """R, or a rotation vector, and T take points of the first camera's frame to each one's."""
-    content, count = _entries_of(file), len(file.names)
     numbers = []
-    for key, sizes in (("rvecs" if "rvecs" in content else "Rs", (3, 9)), ("Ts", (3,))):
-        expected = f"{' or '.join(map(str, sizes))} numbers for each of {count} cameras"
-        values = [to_number(value, key) for value in numbers_of(content.get(key, expected))]
-        if len(values) not in [size * count for size in sizes]:
+    for key, sizes in (("rvecs" if "rvecs" in file else "Rs", (3, 9)), ("Ts", (3,))):
+        expected = f"{' or '.join(map(str, sizes))} numbers for each of {len(names)} cameras"
+        values = [to_number(value, key) for value in numbers_of(file.get(key, expected))]
+        if len(values) not in [size * len(names) for size in sizes]:
             raise ValueError(f"{key} must be {expected}, got {len(values)}")
-        numbers.append(np.reshape(values, (count, -1)))
-    poses = {}
-    for name, turn, offset in zip(file.names, *numbers, strict=True):
+        numbers.append(np.reshape(values, (len(names), -1)))
+    poses = []
+    for name, turn, offset in zip(names, *numbers, strict=True):
         rotation = turn.reshape(3, 3) if len(turn) == 9 else from_rotation_vector(turn)
-        poses[name] = inverse(to_pose(f"camera {name}", np.column_stack((rotation, offset))))
-    return poses
+        poses.append(inverse(to_pose(f"camera {name}", np.column_stack((rotation, offset)))))
+    return poses, None, True
 
 
-def _woodscape(file: Fields) -> np.ndarray:
+def _woodscape(file: Fields, names: list[str]) -> Read:
     """The quaternion and the translation take points of the camera's frame to the vehicle's."""
     pose = np.eye(4)
     pose[:3, :3] = camera_to_vehicle(file)
     pose[:3, 3] = file.section("extrinsic").numbers("translation", (3,))
-    return pose
+    return [pose], (0.0, 0.0, 1.0), False
+
+
+_POSES: dict[str, Callable[[Fields, list[str]], Read]] = {
+    "Kalibr": _kalibr, "OpenCV multi-view": _multi_view, "WoodScape": _woodscape
+}  # fmt: skip
 
 
 def _matrix(camera: Fields, name: str) -> np.ndarray:
@@ -307,7 +312,7 @@ def _matrix(camera: Fields, name: str) -> np.ndarray:
 
 def _with_matrix(content: Mapping) -> list[str]:
     """The names of cameras of which each has a matrix; "" for the only one of a file."""
-    if any(isinstance(content.get(key), (list, str)) for key in MATRIX):
+    if any(len(numbers_of(content.get(key))) in (12, 16) for key in MATRIX):
         return [""]
     inside = content.get("cameras", content)
     entries = inside.items() if isinstance(inside, Mapping) else ()
