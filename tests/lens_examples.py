@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
+from scipy.spatial.transform import Rotation
 
 from darswin.lens import (
     MODELS,
@@ -38,6 +39,15 @@ def file_text(name: str) -> str:
 
 def double(*values):
     return torch.tensor(values, dtype=f64)
+
+
+def poses(seed: int, count: int) -> list[np.ndarray]:
+    """Random poses (4, 4) of cameras in a rig."""
+    rng = np.random.default_rng(seed)
+    found = np.tile(np.eye(4), (count, 1, 1))
+    found[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    found[:, :3, 3] = rng.normal(size=(count, 3))
+    return list(found)
 
 
 # A camera of 1280 × 960 px, and its calibration in the forms of other tools.

@@ -8,7 +8,7 @@ import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from lens_examples import poses
 
 from darswin.lens import Equidistant, KannalaBrandt, Perspective, Rig, cat
 from darswin.lens.rig import CUBES, ahead_of
@@ -22,15 +22,6 @@ FACES = {
     "+z": lambda x, y, z: (x, -y, z), "-z": lambda x, y, z: (-x, -y, -z),
 }  # fmt: skip
 PLACES = {"+x": "right", "-x": "left", "+y": "up", "-y": "down", "+z": "front", "-z": "back"}
-
-
-def poses(seed: int, count: int) -> list[np.ndarray]:
-    """Random poses."""
-    rng = np.random.default_rng(seed)
-    found = np.tile(np.eye(4), (count, 1, 1))
-    found[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
-    found[:, :3, 3] = rng.normal(size=(count, 3))
-    return list(found)
 
 
 @pytest.mark.parametrize("faces", CUBES)
@@ -101,7 +92,10 @@ def test_errors_of_rigs_name_the_camera():
     eye, sized = np.eye(4), LENS.replace(image_size=torch.tensor([SIZE]))
     for said, camera in (
         ("camera b: a camera has one lens, got 2", (cat([LENS, LENS]), SIZE, eye)),
-        ("camera b: its lens belongs to pictures of .*400, 600.*, got .*4, 4", (sized, (4, 4), eye)),
+        (
+            "camera b: its lens belongs to pictures of .*400, 600.*, got .*4, 4",
+            (sized, (4, 4), eye),
+        ),
         ("camera b: .*has a size of its pictures", (LENS, None, eye)),
         ("camera b: .*at least 2 × 2 px, got", (LENS, (1, 9), eye)),
         ("camera b: .*at least 2 × 2 px, got", (LENS, (9,), eye)),
