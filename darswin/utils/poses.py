@@ -43,18 +43,12 @@ def from_quaternion(name: str, w: float, x: float, y: float, z: float) -> np.nda
     length = math.hypot(w, x, y, z)
     if not 0 < length < math.inf:
         raise ValueError(f"{name} must not be zero")
-    vector = np.array((x, y, z)) / length
-    return _turned(w / length, vector)
+    w, x, y, z = (value / length for value in (w, x, y, z))
+    cross = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
+    return np.asarray(np.eye(3) + 2 * (w * cross + cross @ cross))
 
 
 def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) about an axis by its length, rad, as of cv2.Rodrigues."""
+    """The rotation (3, 3) about a vector by its length, rad, as of cv2.Rodrigues."""
     half = np.linalg.norm(vector) / 2
-    return _turned(math.cos(half), vector / 2 * np.sinc(half / math.pi))
-
-
-def _turned(w: float, vector: np.ndarray) -> np.ndarray:
-    """The rotation of a unit quaternion."""
-    x, y, z = vector
-    cross = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
-    return np.asarray(np.eye(3) + 2 * (w * cross + cross @ cross))
+    return from_quaternion("", math.cos(half), *(vector / 2 * np.sinc(half / math.pi)))

@@ -41,7 +41,7 @@ _RIGS = (
 
 Vector = Sequence[float]
 # The pose of each camera, up if the file says it, and whether the frame is that of a camera.
-Read = tuple[list[np.ndarray], Vector | None, bool]
+Read = tuple[dict[str, np.ndarray], Vector | None, bool]
 Parts = tuple[Lens, Size, np.ndarray]
 
 
@@ -106,8 +106,8 @@ class Reader(NamedTuple):
         self._goes(DIRECTIONS[0])
         lenses = file.lenses(image_size=self.image_size, dtype=torch.float64)
         cameras: dict[str, Parts] = {
-            path.stem if name == "camera" else name: (lens, None, pose)
-            for (name, lens), pose in zip(lenses.items(), poses, strict=True)
+            path.stem if name == "camera" else name: (lenses[name], None, pose)
+            for name, pose in poses.items()
         }
         return Found(cameras, up, None, in_camera)
 
@@ -136,13 +136,12 @@ class Reader(NamedTuple):
             key = next((key for key in MATRIX if key in camera), MATRIX[0])
             pose = _matrix(camera, key)
             is_own = "lens" in camera
-            lens = camera.section("lens").entries if is_own else camera.entries
-            rest = {k: v for k, v in lens.items() if k != key}
-            reader = self._replace(image_size=None) if is_own else self
-            size = camera.sides("size") if is_own and "size" in camera else None
+            entries = camera.section("lens").entries if is_own else camera.entries
+            text = json.dumps({k: v for k, v in entries.items() if k != key})
+            size = camera.sides("size") if is_own else None
+            reader, name = self._replace(image_size=None) if is_own else self, name or path.stem
             pose = pose if goes == DIRECTIONS[0] else inverse(pose)
-            name = name or path.stem
-            cameras[name] = reader._lens(json.dumps(rest), name), size, pose
+            cameras[name] = reader._lens(text, name), size, pose
         up, forward = (file.numbers(k, (3,)) if k in file else None for k in ("up", "forward"))
         return Found(cameras, up, forward)
 
@@ -153,8 +152,7 @@ class Reader(NamedTuple):
         self._goes(DIRECTIONS[1])
         entries = rigs[0].sections("cameras")
         named = _by_name((entry.text("image_prefix").strip("/"), entry) for entry in entries)
-        lenses = self._reconstructed([*named])
-        cameras, reference = dict[str, Parts](), []
+        lenses, cameras, reference = self._lenses(named), dict[str, Parts](), []
         for name, entry in named.items():
             pose = np.eye(4)
             if "ref_sensor" in entry and to_flag(entry.entries["ref_sensor"], "ref_sensor"):
@@ -163,37 +161,34 @@ class Reader(NamedTuple):
                 key = "cam_from_rig_rotation"  # w first
                 pose[:3, :3] = from_quaternion(entry.path(key), *entry.numbers(key, (4,)))
                 pose[:3, 3] = entry.numbers("cam_from_rig_translation", (3,))
-            lens = lenses[name] if lenses else self._lens(self._row(name, entry), name)
-            cameras[name] = lens, None, inverse(pose)
+            cameras[name] = lenses[name], None, inverse(pose)
         if len(reference) != 1:
             raise ValueError(f"one camera must be the ref_sensor, got {len(reference)}")
         return Found(cameras, in_camera=True)
 
-    def _row(self, name: str, camera: Fields) -> str:
-        """A line of cameras.txt, from a model and its parameters."""
-        if self.image_size is None or "camera_model_name" not in camera:
-            raise ValueError(
-                f"camera {short(name)} has no lens: give the reconstruction's cameras.txt or "
-                "cameras.bin as `cameras`, or `image_size` beside camera_model_name and "
-                "camera_params in the file"
-            )
-        height, width = self.image_size
-        words = camera.of_kind("camera_params", list, "numbers")
-        return " ".join(map(str, (1, camera.text("camera_model_name"), width, height, *words)))
-
-    def _reconstructed(self, names: list[str]) -> dict[str, Lens]:
-        """The lenses in the file `cameras`. COLMAP's feature_extractor counts the folders of
-        cameras in the order of their names."""
-        if self.cameras is None:
-            return {}
-        file = Calibration.read(self.cameras)
-        lenses = file.lenses(image_size=self.image_size, dtype=torch.float64)
-        ids = sorted(lenses, key=lambda name: (len(name), name))
-        if not file.has_several():
-            ids = ids[:1] * len(names)
-        if len(ids) != len(names):
-            raise ValueError(f"{file.what} has {len(ids)} cameras, but the rig has {len(names)}")
-        return {name: lenses[i] for name, i in zip(sorted(names), ids, strict=True)}
+    def _lenses(self, cameras: Mapping[str, Fields]) -> dict[str, Lens]:
+        """The lenses of COLMAP's cameras, in the file `cameras` or beside the poses."""
+        if self.cameras is not None:
+            file = Calibration.read(self.cameras)
+            lenses = file.lenses(image_size=self.image_size, dtype=torch.float64)
+            # feature_extractor counts the folders of cameras in the order of their names.
+            ids = sorted(lenses, key=lambda name: (len(name), name))
+            ids = ids if file.has_several() else ids[:1] * len(cameras)
+            if len(ids) != len(cameras):
+                raise ValueError(f"{file.what} has {len(ids)} cameras, the rig {len(cameras)}")
+            return {name: lenses[i] for name, i in zip(sorted(cameras), ids, strict=True)}
+        found = {}
+        for name, camera in cameras.items():
+            if self.image_size is None or "camera_model_name" not in camera:
+                raise ValueError(
+                    f"camera {short(name)} has no lens: give the reconstruction's cameras.txt or "
+                    "cameras.bin as `cameras`, or `image_size` beside camera_model_name and "
+                    "camera_params in the file"
+                )
+            words = camera.of_kind("camera_params", list, "numbers")
+            kind, (height, width) = camera.text("camera_model_name"), self.image_size
+            found[name] = self._lens(" ".join(map(str, (1, kind, width, height, *words))), name)
+        return found
 
     def _kitti360(self, folder: Path) -> Found:
         self._goes(DIRECTIONS[0])
@@ -205,7 +200,7 @@ class Reader(NamedTuple):
             cameras[path.stem] = lens, None, _matrix(Fields(content), path.stem)
         if not cameras:
             raise ValueError(f"image_02.yaml and image_03.yaml must stand beside {KITTI}")
-        return Found(cameras, (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+        return Found(cameras, (0.0, 0.0, -1.0))
 
 
 @contextmanager
@@ -214,7 +209,7 @@ def about(path: Any) -> Iterator[None]:
     try:
         yield
     except (ValueError, RecursionError) as error:
-        if str(path) in str(error):
+        if f" {path}:" in f" {error}" or str(error).startswith("rig "):
             raise
         raise ValueError(f"rig {path}: {error}") from error
 
@@ -270,7 +265,7 @@ def _kalibr(file: Fields, names: list[str]) -> Read:
         else:  # the only one
             in_camera = True
         poses[name] = pose
-    return [poses[name] for name in names], None, in_camera
+    return poses, None, in_camera
 
 
 def _multi_view(file: Fields, names: list[str]) -> Read:
@@ -282,10 +277,10 @@ def _multi_view(file: Fields, names: list[str]) -> Read:
         if len(values) not in [size * len(names) for size in sizes]:
             raise ValueError(f"{key} must be {expected}, got {len(values)}")
         numbers.append(np.reshape(values, (len(names), -1)))
-    poses = []
+    poses = {}
     for name, turn, offset in zip(names, *numbers, strict=True):
         rotation = turn.reshape(3, 3) if len(turn) == 9 else from_rotation_vector(turn)
-        poses.append(inverse(to_pose(f"camera {name}", np.column_stack((rotation, offset)))))
+        poses[name] = inverse(to_pose(f"camera {name}", np.column_stack((rotation, offset))))
     return poses, None, True
 
 
@@ -294,7 +289,7 @@ def _woodscape(file: Fields, names: list[str]) -> Read:
     pose = np.eye(4)
     pose[:3, :3] = camera_to_vehicle(file)
     pose[:3, 3] = file.section("extrinsic").numbers("translation", (3,))
-    return [pose], (0.0, 0.0, 1.0), False
+    return {names[0]: pose}, (0.0, 0.0, 1.0), False
 
 
 _POSES: dict[str, Callable[[Fields, list[str]], Read]] = {
