@@ -21,13 +21,12 @@ from darswin.lens.parameter import Number
 from darswin.lens.pixels import distance_to_z, pixel_rays, z_to_distance
 from darswin.lens.plausible import ImplausibleLens
 from darswin.lens.polynomial import OCam, OCamInverse, Polynomial
-from darswin.lens.rig import Rig
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
 
 __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
     "FieldOfView", "Fisheye624", "Fit", "ImplausibleLens", "KannalaBrandt", "Lens", "Mei", "Number",
-    "OCam", "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Rig", "Spherical",
+    "OCam", "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical",
     "Stereographic", "Tabulated", "cat", "distance_to_z", "fit", "from_dict", "load",
     "load_all", "load_up", "pixel_rays", "save", "to_dict",
     "z_to_distance",

@@ -215,7 +215,7 @@ class Rig:
 
     @property
     def level(self) -> np.ndarray:
-        """The rotation (3, 3) to the rig's frame from its level one: x right, y down, z ahead."""
+        """The rotation (3, 3) to the rig's frame from its level one, x right, y down, z ahead."""
         down = -np.array(self.up)
         right = np.cross(down, self.forward)
         right /= np.linalg.norm(right)

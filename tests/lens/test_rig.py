@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import poses
 
-from darswin.lens import Equidistant, KannalaBrandt, Perspective, Rig, cat
+from darswin import Rig
+from darswin.lens import Equidistant, KannalaBrandt, Perspective, cat
 from darswin.lens.rig import CUBES, ahead_of
 
 SIZE = (400, 600)

@@ -17,7 +17,8 @@ from helpers import few_calls, refused
 from lens_examples import FILES, K, file_text, poses
 from scipy.spatial.transform import Rotation
 
-from darswin.lens import BrownConrady, DoubleSphere, Equidistant, KannalaBrandt, OCam, Rig, to_dict
+from darswin import Rig
+from darswin.lens import BrownConrady, DoubleSphere, Equidistant, KannalaBrandt, OCam, to_dict
 from darswin.lens import load as load_lens
 
 SIZE = (960, 1280)
