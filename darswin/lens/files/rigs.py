@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import yaml
 
 from darswin.lens.base import Lens, to_dict
 from darswin.lens.files.content import decoded, parse, read_bytes
-from darswin.lens.files.fields import Fields, short, to_flag, to_number
+from darswin.lens.files.fields import Fields, listed, short, to_flag, to_number
 from darswin.lens.files.load import Calibration
 from darswin.lens.files.named import KALIBR
 from darswin.lens.files.opencv import numbers_of
@@ -23,6 +23,7 @@ from darswin.lens.files.woodscape import camera_to_vehicle
 from darswin.lens.image import Size
 from darswin.utils.files import replace_file
 from darswin.utils.poses import from_quaternion, from_rotation_vector, inverse, to_pose
+from darswin.utils.text import mapping
 
 DIRECTIONS = ("camera_to_rig", "rig_to_camera")
 # A camera's matrix in our own files, and in others that do not say its direction.
@@ -78,18 +79,19 @@ class Reader(NamedTuple):
             paths = sorted(p for p in paths[0].iterdir() if p.suffix.lower() in SUFFIXES)
         if not paths:
             raise ValueError(f"there are no files ({', '.join(SUFFIXES)}), and no {KITTI}")
-        found = []
+        cameras, ups = dict[str, Parts](), set()
         for one in paths:
             with about(one):
-                found.append(self._file(one))
-        if len(found) == 1:
-            return found[0]
-        for one, its in zip(paths, found, strict=True):
-            if its.in_camera:
-                raise ValueError(f"the poses of {one} are in a camera's frame: give it alone")
-        ups = {its.up and (*its.up,) for its in found}
-        cameras = (camera for its in found for camera in its.cameras.items())
-        return Found(_by_name(cameras), ups.pop() if len(ups) == 1 else None)
+                found = self._file(one)
+                if len(paths) == 1:
+                    return found
+                if found.in_camera:
+                    raise ValueError("its poses are in a camera's frame: give it alone")
+                if twice := cameras.keys() & found.cameras:
+                    raise ValueError(f"two cameras are called {listed(twice)}")
+            cameras |= found.cameras
+            ups.add(found.up and (*found.up,))
+        return Found(cameras, ups.pop() if len(ups) == 1 else None)
 
     def _file(self, path: Path) -> Found:
         text = decoded(read_bytes(path))
@@ -151,7 +153,7 @@ class Reader(NamedTuple):
             raise ValueError(f"it must hold one rig, got {len(rigs)}: keep one of them")
         self._goes(DIRECTIONS[1])
         entries = rigs[0].sections("cameras")
-        named = _by_name((entry.text("image_prefix").strip("/"), entry) for entry in entries)
+        named = mapping((entry.text("image_prefix").strip("/"), entry) for entry in entries)
         lenses, cameras, reference = self._lenses(named), dict[str, Parts](), []
         for name, entry in named.items():
             pose = np.eye(4)
@@ -313,12 +315,3 @@ def _with_matrix(content: Mapping) -> list[str]:
     entries = inside.items() if isinstance(inside, Mapping) else ()
     found = [n for n, c in entries if isinstance(c, Mapping) and not {*MATRIX}.isdisjoint(c)]
     return [*inside] if found and "cameras" in content else found
-
-
-def _by_name(cameras: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, camera in cameras:
-        if name in found:
-            raise ValueError(f"two cameras are called {short(name)}")
-        found[name] = camera
-    return found
