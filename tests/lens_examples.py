@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from scipy.spatial.transform import Rotation
 
 from darswin.lens import (
     MODELS,
@@ -45,7 +44,8 @@ def poses(seed: int, count: int) -> list[np.ndarray]:
     """Random poses (4, 4) of cameras in a rig."""
     rng = np.random.default_rng(seed)
     found = np.tile(np.eye(4), (count, 1, 1))
-    found[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    turns = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    found[:, :3, :3] = turns * np.linalg.det(turns)[:, None, None]
     found[:, :3, 3] = rng.normal(size=(count, 3))
     return list(found)
 

@@ -9,7 +9,6 @@ import warnings
 import cv2
 import hypothesis
 import numpy as np
-import pycolmap
 import pytest
 import torch
 import yaml
@@ -165,7 +164,10 @@ def test_woodscape_turns_vectors_of_the_camera_to_the_vehicle(tmp_path):
     refused(f"^rig .*{other}: its poses are in a camera's frame", Rig.load, [paths[0], other])
 
 
+@pytest.mark.unsanitized
 def test_pycolmap_projects_with_its_rig_config(tmp_path):
+    import pycolmap  # 130 MB that no other test needs
+
     path, rows = written(tmp_path / "rig_config.json", colmap()), tmp_path / "cameras.txt"
     config = pycolmap.read_rig_config(path)[0].cameras
 
