@@ -124,6 +124,31 @@ def test_opencv_projects_with_r_and_t_of_its_multi_view_file(end, tmp_path):
         assert (rig.names, rig.up, rig.forward) == (("l", "m", "r"), (0, -1, 0), (0, 0, 1))
 
 
+def test_opencv_finds_the_poses_that_its_pictures_were_made_with(tmp_path):
+    rng, turns = np.random.default_rng(0), [np.eye(4) for _ in range(3)]
+    for i in (1, 2):
+        turns[i][:3] = np.column_stack((cv2.Rodrigues((0, 0.2 * i, 0.1))[0], (0.2 * i, 0.05, 0)))
+    board = np.array([[x, y, 0] for y in range(6) for x in range(8)], np.float32) * np.float32(0.1)
+    seen, known = [[], [], []], (np.array(K), np.array(TERMS))
+    for _ in range(12):
+        at = rng.uniform((-0.5, -0.4, 1.2), (0.1, 0.1, 1.3))
+        points = board @ cv2.Rodrigues(0.3 * rng.normal(size=3))[0].T + at
+        for turn, pixels in zip(turns, seen, strict=True):
+            args = points[:, None], cv2.Rodrigues(turn[:3, :3])[0], turn[:3, 3], *known
+            pixels.append(cv2.fisheye.projectPoints(*args)[0][:, 0].astype(np.float32))
+    _, matrices, terms, rotations, offsets = cv2.calibrateMultiview(
+        [board] * 12, seen, [(1280, 960)] * 3, np.ones((3, 12), np.uint8),
+        np.full(3, cv2.CALIB_MODEL_FISHEYE, np.uint8), [known[0]] * 3, [known[1]] * 3, None, None,
+        None, cv2.CALIB_USE_INTRINSIC_GUESS,
+    )[:5]  # fmt: skip
+    content = views(Ks=matrices, distortions=terms, Rs=np.array(rotations), Ts=np.array(offsets))
+    del content["rvecs"]
+    content = {key: np.array(value).tolist() for key, value in content.items()}
+    rig = Rig.load(written(tmp_path / "views.json", content))
+    for turn, camera in zip(turns, rig.cameras.values(), strict=True):
+        assert np.linalg.inv(camera.pose) == pytest.approx(turn, abs=1e-6)
+
+
 def test_kalibr_leads_from_each_camera_to_the_next_or_from_the_imu(tmp_path):
     path, content = tmp_path / "camchain.yaml", chain()
     rig = Rig.load(written(path, yaml.safe_dump(content)), up=(0, -0.1, -2))  # it looks down
@@ -164,7 +189,6 @@ def test_woodscape_turns_vectors_of_the_camera_to_the_vehicle(tmp_path):
     refused(f"^rig .*{other}: its poses are in a camera's frame", Rig.load, [paths[0], other])
 
 
-@pytest.mark.unsanitized
 def test_pycolmap_projects_with_its_rig_config(tmp_path):
     import pycolmap  # 130 MB that no other test needs
 
