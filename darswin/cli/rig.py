@@ -175,7 +175,7 @@ def open_rig(
     coefficients: Coefficients | None,
 ) -> Rig:  # fmt: skip
     """The rig of a file or a folder, or of `cube:SIDE`."""
-    given = dict(up=up, height=height, direction=direction, coefficients=coefficients)
+    given = dict[str, Any](up=up, height=height, direction=direction, coefficients=coefficients)
     name, colon, side = rig.partition(":")
     if name != "cube" or not colon:
         return Rig.load(rig, **given)

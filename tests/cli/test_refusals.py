@@ -124,6 +124,9 @@ REFUSED = {
     """,
     "rig": r"""
         turn cube:8 => invalid choice: 'turn'
+        show front.json => front.json: it has no poses: files of rigs are those of Kalibr
+        show poses.json => rig poses.json: which way its poses go: give --direction, camera_to
+        show poses.json --direction camera_to_rig => which way is up in its frame: give --up$
         show cube:big => a cube is cube:SIDE, with the side of its pictures in px, got cube:big
         show cube:8 --height 2 => --height must be left out for a cube, got 2.0
         show cube:8 --out rig.gif => must end in one of \.png
@@ -335,6 +338,7 @@ FILES_OF_TEXT = {
     "other.json": {"name": "A camera", "focal_mm": 2.1},
     "front.json": to_dict(FRONT),
     "bare.json": to_dict(Polynomial([300.0], 1.5)),
+    "poses.json": {"cameras": {"left": to_dict(FRONT) | {"pose": np.eye(4).tolist()}}},
     "wrong.json": {"model": "Spherical"},
     "out/undistorted.json": [],
     "boards/0.png": "no picture",
