@@ -56,18 +56,18 @@ def show(
     check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
     remap = _view(cameras, side=DRAWN, span=span).at(cameras, seam="narrow")
-    picture = remap(_first(cameras, pictures)) if pictures else None
+    picture = remap(_first(cameras, pictures, out)) if pictures else None
     counts, what = remap.seen_by.sum(0), "sphere"
     weights = np.ones(counts.shape)
     if isinstance(remap.view, GroundView):
         what = f"ground, {remap.view.span:g} m wide"
     else:  # rows are latitudes
         weights *= np.sin(math.pi * (np.arange(len(counts)) + 0.5) / len(counts))[:, None]
-    none, one = (np.average(counts == k, weights=weights) for k in (0, 1))
+    shares = [np.average(seen, weights=weights) for seen in (counts == 1, counts > 1, counts == 0)]
     save_figure(draw_rig(remap, picture), out)
     for name, camera in cameras.cameras.items():
         print(f"{name}: {_described(camera, cameras)}")
-    parts = f"{one:.1%} are seen by one camera, {1 - one - none:.1%} by more and {none:.1%} by none"
+    parts = "{:.1%} are seen by one camera, {:.1%} by more and {:.1%} by none".format(*shares)
     print(f"of the {what}, {parts}\n{out}")
 
 
@@ -149,10 +149,9 @@ def compare(
 
     if out is not None:
         figure_format(out)
-        check_out(out, ())
     cameras = open_rig(rig, up, height, direction, coefficients)
     remap = _view(cameras, side=COMPARED, span=span).at(cameras, distance=distance)
-    frames = _first(cameras, pictures)
+    frames = _first(cameras, pictures, out)
     gains = dict(zip(cameras.names, remap.gains(frames), strict=True))
     levelled = {name: frame.astype(np.float32) * gains[name] for name, frame in frames.items()}
     means, apart = remap.disagreement(levelled)
@@ -216,11 +215,13 @@ def _view(
     return GroundView(size, **given | {k: v for k, v in ground.items() if v is not None})
 
 
-def _first(rig: Rig, pictures: Sequence[str]) -> "dict[str, np.ndarray]":
-    """The pictures of the first frame."""
+def _first(rig: Rig, pictures: Sequence[str], out: str | None) -> dict[str, np.ndarray]:
+    """The pictures of the first frame; ValueError if `out` would replace one."""
     from darswin.cli.rig_files import files_of, read_frames
 
-    return read_frames(rig, min(files_of(pictures, rig.names).items())[1])
+    files = min(files_of(pictures, rig.names).items())[1]
+    check_out(out, map(str, files.values()))
+    return read_frames(rig, files)
 
 
 def _described(camera: Camera, rig: Rig) -> str:
@@ -238,7 +239,7 @@ def _described(camera: Camera, rig: Rig) -> str:
     return f"{type(camera.lens).__name__}, {in_px(camera.size)}; {place}; {', '.join(angles)}"
 
 
-def _better(remap: "RigRemap", frames: "dict[str, np.ndarray]") -> str:
+def _better(remap: "RigRemap", frames: dict[str, np.ndarray]) -> str:
     """The small change by which frames (H, W, C) float32 agree best, if that is clear."""
     rig, seen_now = remap.rig, remap.seen_by
     images = [torch.from_numpy(frame).movedim(2, 0)[None].contiguous() for frame in frames.values()]

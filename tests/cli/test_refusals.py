@@ -125,7 +125,7 @@ REFUSED = {
     "rig": r"""
         turn cube:8 => invalid choice: 'turn'
         show front.json => front.json: it has no poses: files of rigs are those of Kalibr
-        show poses.json => rig poses.json: which way its poses go: give --direction, camera_to
+        show poses.json => which way its poses go: give --direction, camera_to
         show poses.json --direction camera_to_rig => which way is up in its frame: give --up$
         show cube:big => a cube is cube:SIDE, with the side of its pictures in px, got cube:big
         show cube:8 --height 2 => --height must be left out for a cube, got 2.0
@@ -136,6 +136,8 @@ REFUSED = {
         show cube:8 gone => no file or folder gone
         show cube:8 front=cube/up.png => there is no picture of the camera right$
         show cube:8 cubes => the camera right has no frame 2, but others have
+        show cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
+        check cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
         check cube:8 cube => no two cameras see the same places
         stitch cube:8 --out new.png => missing pictures: give a folder
         stitch cube:8 two_faces --out new.png => no picture of the camera back in two_faces$
