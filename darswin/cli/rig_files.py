@@ -28,13 +28,25 @@ def files_of(
         FileNotFoundError, ValueError: a file is missing, or it is unclear whose it is.
     """
     suffixes = SUFFIXES if suffixes is None else suffixes
+    if not words:
+        raise ValueError("missing pictures: give a folder with one of each camera, or NAME=PATH")
+    given = [(name, path) for name, _, path in (word.partition("=") for word in words)]
+    if len(words) == 1 and "=" not in words[0]:
+        check_paths(words)
+        if not Path(words[0]).is_dir():
+            raise ValueError(f"{words[0]} must be a folder with a picture of each camera")
+        entries = _entries(Path(words[0]), suffixes)
+        given = [(entry.name if entry.is_dir() else entry.stem, str(entry)) for entry in entries]
     found: dict[str, dict[str, Path]] = {}
-    for name, path in _given(words, suffixes):
+    for name, path in given:
+        if not path:
+            raise ValueError(f"{name} must be NAME=PATH, or a folder that is given alone")
         if name not in names:
             raise ValueError(f"{path} is of no camera: they are {', '.join(names)}")
-        files = [("", path)]
-        if path.is_dir():
-            files = [(file.stem, file) for file in _entries(path, suffixes) if file.is_file()]
+        check_paths([path])
+        files = [("", Path(path))]
+        if Path(path).is_dir():
+            files = [(f.stem, f) for f in _entries(Path(path), suffixes) if f.is_file()]
         for frame, file in files:
             if (other := found.setdefault(name, {}).setdefault(frame, file)) != file:
                 raise ValueError(f"{other} and {file} are both of the camera {name}: remove one")
@@ -66,23 +78,6 @@ def check_sizes(rig: Rig, files: Files, frames: dict[str, np.ndarray]) -> dict[s
             size, found = in_px(rig[name].size), in_px(frame.shape[:2])
             raise ValueError(f"{files[name]} must be of {size}, as its camera, got {found}")
     return frames
-
-
-def _given(words: Sequence[str], suffixes: Collection[str]) -> list[tuple[str, Path]]:
-    """The names of cameras, and a file or a folder of each."""
-    if not words:
-        raise ValueError("missing pictures: give a folder with one of each camera, or NAME=PATH")
-    if len(words) == 1 and "=" not in words[0]:
-        check_paths(words)
-        if not Path(words[0]).is_dir():
-            raise ValueError(f"{words[0]} must be a folder with a picture of each camera")
-        entries = _entries(Path(words[0]), suffixes)
-        return [(entry.name if entry.is_dir() else entry.stem, entry) for entry in entries]
-    for word in words:
-        if "=" not in word:
-            raise ValueError(f"{word} must be NAME=PATH, or a folder that is given alone")
-    check_paths(word.partition("=")[2] for word in words)
-    return [(name, Path(path)) for name, _, path in (word.partition("=") for word in words)]
 
 
 def _entries(folder: Path, suffixes: Collection[str]) -> list[Path]:

@@ -135,6 +135,8 @@ REFUSED = {
         show cube:8 p.png => p.png must be a folder with a picture of each camera
         show cube:8 gone => no file or folder gone
         show cube:8 front=cube/up.png => there is no picture of the camera right$
+        show cube:8 front=p.png front=in/p.png => p.png and in/p.png are both of the camera front
+        show cube:8 front=p.png right=cubes/right => give either a picture or a folder of each
         show cube:8 cubes => the camera right has no frame 2, but others have
         show cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
         check cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
