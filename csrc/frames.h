@@ -55,9 +55,9 @@ struct FrameArgs {
 constexpr int64_t kFrameSpare = 16;
 
 // Pixels of a rig's output that follow each other and have kRigReads reads at most, or one with
-// more, or any number of pixels without reads. The next group begins where this one ends.
+// more, or pixels without reads. Its runs and reads end where those of the next group begin.
 struct RigGroup {
-  int64_t pixel, read, run;
+  int64_t pixel, pixels, read, run;
 };
 constexpr int64_t kRigReads = 256;
 
@@ -65,7 +65,8 @@ constexpr int64_t kRigReads = 256;
 struct RigRun {
   int32_t count;
   uint8_t source;
-  bool in_order;  // they belong to pixels that follow each other
+  bool in_order;    // they belong to pixels that follow each other
+  bool unweighted;  // all weights are 1
 };
 
 // A pixel is the sum of its reads, which are bilinear samples times their weights.
@@ -75,7 +76,7 @@ struct RigArgs {
   const int16_t *columns, *rows;
   const float *right, *lower, *weights;
   const uint8_t* pixels;
-  const RigGroup* groups;  // one that begins at the end is the last
+  const RigGroup* groups;  // the last one has no pixels, and follows the others
   const RigRun* runs;
   const float *scale, *offset;  // (C,): a sum v becomes v * scale + offset
   FrameTarget to;

@@ -9,6 +9,11 @@
 #include "parallel.h"
 
 namespace darswin {
+namespace {
+
+constexpr int64_t kStrip = 160;  // pixels
+
+}  // namespace
 
 RigSampler::RigSampler(const RigPlan& plan)
     : height(plan.height),
@@ -52,26 +57,35 @@ RigSampler::RigSampler(const RigPlan& plan)
       throw std::invalid_argument("the plan's weights must be finite and not below 0");
     }
   }
-  for (size_t pixel = 0, read = 0, end, next; pixel < count; pixel = end, read = next) {
-    const bool seen = plan.counts[pixel] > 0;
-    next = read + plan.counts[pixel];
-    for (end = pixel + 1; end < count && (plan.counts[end] > 0) == seen &&
-                          next + plan.counts[end] <= read + kRigReads;) {
-      next += plan.counts[end++];
+  std::vector<int64_t> before(count + 1);  // reads before each pixel
+  std::partial_sum(plan.counts.begin(), plan.counts.end(), before.begin() + 1);
+  // What follows each other in a strip reads places that are near each other.
+  for (int64_t left = 0, next; left < width; left = next) {
+    next = std::min(left + kStrip, width);
+    for (int64_t row = 0; row < height; ++row) {
+      for (int64_t pixel = row * width + left, last = row * width + next, end; pixel < last;
+           pixel = end) {
+        const bool seen = plan.counts[pixel] > 0;
+        for (end = pixel + 1; end < last && (plan.counts[end] > 0) == seen &&
+                              before[end + 1] - before[pixel] <= kRigReads;) {
+          ++end;
+        }
+        add_group(plan, pixel, end, before[pixel]);
+      }
     }
-    add_group(plan, pixel, end, read);
   }
-  add_group(plan, count, count, reads);
+  add_group(plan, 0, 0, 0);
   for (auto* places : {&columns, &rows}) places->resize(reads + kFrameSpare);
   for (auto* numbers : {&right, &lower}) numbers->resize(reads + kFrameSpare);
 }
 
-void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t first) {
-  groups.push_back({begin, first, static_cast<int64_t>(runs.size())});
+void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read) {
+  groups.push_back(
+      {begin, end - begin, static_cast<int64_t>(pixels.size()), static_cast<int64_t>(runs.size())});
   std::vector<std::pair<int64_t, uint8_t>> reads;  // and their pixels
   for (int64_t pixel = begin; pixel < end; ++pixel) {
     for (int k = 0; k < plan.counts[pixel]; ++k) {
-      reads.emplace_back(first++, static_cast<uint8_t>(pixel - begin));
+      reads.emplace_back(read++, static_cast<uint8_t>(pixel - begin));
     }
   }
   // Blocks of one source are long, and a pixel has few reads of each.
@@ -82,11 +96,12 @@ void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int6
   for (const auto& [k, pixel] : reads) {
     if (runs.size() == static_cast<size_t>(groups.back().run) ||
         runs.back().source != plan.sources[k]) {
-      runs.push_back({0, plan.sources[k], true});
+      runs.push_back({0, plan.sources[k], true, true});
       last = pixel - 1;
     }
     ++runs.back().count;
     runs.back().in_order &= pixel == ++last;
+    runs.back().unweighted &= plan.weights[k] == 1;
     columns.push_back(plan.columns[k]), rows.push_back(plan.rows[k]);
     right.push_back(plan.right[k]), lower.push_back(plan.lower[k]);
     weights.push_back(plan.weights[k]), pixels.push_back(pixel);

@@ -160,14 +160,17 @@ void sample(const FrameArgs& a, int64_t begin, int64_t end) {
 }
 
 // Adds the weighted samples of a block to the sums of a group's pixels.
-void add_block(const RigArgs& a, bool in_order, int64_t first, int64_t count,
+void add_block(const RigArgs& a, const RigRun& run, int64_t first, int64_t count,
                const ByteBlock& block, float (&sums)[3][kByteBlock]) {
   const float* weights = a.weights + first;
   const uint8_t* pixels = a.pixels + first;
   for (int64_t c = 0; c < a.to.channels; ++c) {
     const float* samples = block.samples[c];
-    float* sum = sums[c] + (in_order ? pixels[0] : 0);
-    if (in_order) {
+    float* sum = sums[c] + (run.in_order ? pixels[0] : 0);
+    if (run.in_order && run.unweighted) {
+#pragma omp simd
+      for (int64_t k = 0; k < count; ++k) sum[k] += samples[k];
+    } else if (run.in_order) {
 #pragma omp simd
       for (int64_t k = 0; k < count; ++k) sum[k] += weights[k] * samples[k];
     } else {
@@ -180,7 +183,7 @@ void sample_rig(const RigArgs& a, int64_t begin, int64_t end) {
   alignas(64) ByteBlock block;
   alignas(64) float sums[3][kByteBlock];
   for (const RigGroup* group = a.groups + begin; group < a.groups + end; ++group) {
-    const int64_t count = group[1].pixel - group->pixel;
+    const int64_t count = group->pixels;
     if (group->run == group[1].run) {
       write_zeros(a.to, group->pixel, count);
       continue;
@@ -191,7 +194,7 @@ void sample_rig(const RigArgs& a, int64_t begin, int64_t end) {
       for (int64_t left = run->count, next; left > 0; left -= next, read += next) {
         next = smaller(kByteBlock, left);
         sample_block(a.images[run->source], a, read, next, block);
-        add_block(a, run->in_order, read, next, block, sums);
+        add_block(a, *run, read, next, block, sums);
       }
     }
     for (int64_t c = 0; c < a.to.channels && a.to.output != FrameOutput::bytes; ++c) {
