@@ -58,7 +58,7 @@ RigSampler::RigSampler(const RigPlan& plan)
     }
   }
   std::vector<int64_t> before(count + 1);  // reads before each pixel
-  std::partial_sum(plan.counts.begin(), plan.counts.end(), before.begin() + 1);
+  for (size_t k = 0; k < count; ++k) before[k + 1] = before[k] + plan.counts[k];
   // What follows each other in a strip reads places that are near each other.
   for (int64_t left = 0, next; left < width; left = next) {
     next = std::min(left + kStrip, width);
