@@ -55,9 +55,9 @@ struct FrameArgs {
 constexpr int64_t kFrameSpare = 16;
 
 // Pixels of a rig's output that follow each other and have kRigReads reads at most, or one with
-// more, or pixels without reads. Its runs and reads end where those of the next group begin.
+// more, or any number of pixels without reads. The next group begins where this one ends.
 struct RigGroup {
-  int64_t pixel, pixels, read, run;
+  int64_t pixel, read, run;
 };
 constexpr int64_t kRigReads = 256;
 
@@ -76,7 +76,7 @@ struct RigArgs {
   const int16_t *columns, *rows;
   const float *right, *lower, *weights;
   const uint8_t* pixels;
-  const RigGroup* groups;  // the last one has no pixels, and follows the others
+  const RigGroup* groups;  // one that begins at the end is the last
   const RigRun* runs;
   const float *scale, *offset;  // (C,): a sum v becomes v * scale + offset
   FrameTarget to;

@@ -9,11 +9,6 @@
 #include "parallel.h"
 
 namespace darswin {
-namespace {
-
-constexpr int64_t kStrip = 160;  // pixels
-
-}  // namespace
 
 RigSampler::RigSampler(const RigPlan& plan)
     : height(plan.height),
@@ -57,31 +52,22 @@ RigSampler::RigSampler(const RigPlan& plan)
       throw std::invalid_argument("the plan's weights must be finite and not below 0");
     }
   }
-  std::vector<int64_t> before(count + 1);  // reads before each pixel
-  for (size_t k = 0; k < count; ++k) before[k + 1] = before[k] + plan.counts[k];
-  // What follows each other in a strip reads places that are near each other.
-  for (int64_t left = 0, next; left < width; left = next) {
-    next = std::min(left + kStrip, width);
-    for (int64_t row = 0; row < height; ++row) {
-      for (int64_t pixel = row * width + left, last = row * width + next, end; pixel < last;
-           pixel = end) {
-        const bool seen = plan.counts[pixel] > 0;
-        for (end = pixel + 1; end < last && (plan.counts[end] > 0) == seen &&
-                              before[end + 1] - before[pixel] <= kRigReads;) {
-          ++end;
-        }
-        add_group(plan, pixel, end, before[pixel]);
-      }
+  for (size_t pixel = 0, read = 0, end, next; pixel < count; pixel = end, read = next) {
+    const bool seen = plan.counts[pixel] > 0;
+    next = read + plan.counts[pixel];
+    for (end = pixel + 1; end < count && (plan.counts[end] > 0) == seen &&
+                          next + plan.counts[end] <= read + kRigReads;) {
+      next += plan.counts[end++];
     }
+    add_group(plan, pixel, end, read);
   }
-  add_group(plan, 0, 0, 0);
+  add_group(plan, count, count, reads);
   for (auto* places : {&columns, &rows}) places->resize(reads + kFrameSpare);
   for (auto* numbers : {&right, &lower}) numbers->resize(reads + kFrameSpare);
 }
 
 void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read) {
-  groups.push_back(
-      {begin, end - begin, static_cast<int64_t>(pixels.size()), static_cast<int64_t>(runs.size())});
+  groups.push_back({begin, read, static_cast<int64_t>(runs.size())});
   std::vector<std::pair<int64_t, uint8_t>> reads;  // and their pixels
   for (int64_t pixel = begin; pixel < end; ++pixel) {
     for (int k = 0; k < plan.counts[pixel]; ++k) {
