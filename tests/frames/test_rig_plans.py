@@ -161,7 +161,7 @@ def test_plans_are_equal_if_their_attributes_are():
         replace(PLAN, sizes=((6, 9), (5, 5))), replace(PLAN, output="image"),
         replace(PLAN, counts=PLAN.counts.T),
     ]  # fmt: skip
-    assert PLAN == replace(PLAN) and PLAN not in others and PLAN != "plan"
+    assert replace(PLAN) == PLAN and PLAN not in others and PLAN != "plan"
 
 
 def with_first(name, value):
@@ -181,7 +181,7 @@ def with_first(name, value):
           for value in (-0.1, np.nan, np.inf)),
         (with_first("sources", 2), "a camera that it does not name"),
         (with_first("counts", 2), "do not fit together"),
-        *((dict([(name, getattr(PLAN, name)[:-1])]), "do not fit together")
+        *(({name: getattr(PLAN, name)[:-1]}, "do not fit together")
           for name in ("sources", "columns", "rows", "right", "lower", "weights")),
         (dict(sources=PLAN.sources.astype(int)), "sources of a plan must be uint8"),
         (dict(counts=PLAN.counts.ravel()), "counts of a plan must be uint16 with 2 axes"),
@@ -225,7 +225,7 @@ def test_wrong_frames_are_explained(frames, words):
 
 def test_other_wrong_calls_are_explained():
     sampler = Sampler(PLAN)
-    with pytest.raises(TypeError, match="frames must be a list .* got ndarray"):
+    with pytest.raises(TypeError, match=r"frames must be a list .* got ndarray"):
         sampler(FRAMES[0])
     with pytest.raises(TypeError, match="frame of left must be a NumPy array of uint8, got float"):
         sampler([FRAMES[0], FRAMES[1].astype(float)])
