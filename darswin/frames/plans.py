@@ -180,4 +180,6 @@ class Plan(PlanFile):
         if len({parts[name].shape for name in ("columns", "rows", "right", "lower")}) > 1:
             raise ValueError("its places do not fit together")
         height, width = check_size(parts["size"].tolist())
-        return cls(**parts | dict(size=(height, width), supersampling=parts["supersampling"].item()))
+        return cls(
+            **parts | dict(size=(height, width), supersampling=parts["supersampling"].item())
+        )

@@ -4,7 +4,6 @@ import importlib
 import pkgutil
 
 from darswin.views.base import (
-    PixelGrid,
     PolarGrid,
     View,
 )
@@ -13,6 +12,7 @@ from darswin.views.crop import CropView
 from darswin.views.cylindrical import CylindricalView
 from darswin.views.directions import RayView
 from darswin.views.equirectangular import EquirectangularView
+from darswin.views.ground import GroundView
 from darswin.views.mercator import MercatorView
 from darswin.views.orientation import turned, up_of
 from darswin.views.panorama import PanoramaView
@@ -32,10 +32,10 @@ __all__ = [
     "CropView",
     "CylindricalView",
     "EquirectangularView",
+    "GroundView",
     "MercatorView",
     "PanoramaView",
     "PerspectiveView",
-    "PixelGrid",
     "PixelView",
     "PlainView",
     "PolarGrid",
