@@ -3,13 +3,13 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from darswin.frames.plan_files import Output, PlanFile, check_output
 
-_READS = dict(
+_READS: dict[str, type[np.generic]] = dict(
     sources=np.uint8, columns=np.int16, rows=np.int16,
     right=np.float32, lower=np.float32, weights=np.float32,
 )  # fmt: skip
@@ -57,7 +57,9 @@ class RigPlan(PlanFile):
 
     key = "darswin_rig_plan"
     version = 1
-    kinds = dict(counts=np.uint16, sizes=np.int64, mean=np.float64, std=np.float64, **_READS)
+    kinds: ClassVar = dict(
+        counts=np.uint16, sizes=np.int64, mean=np.float64, std=np.float64, **_READS
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,7 +88,7 @@ class RigPlan(PlanFile):
     def of_file(cls, parts: dict[str, Any], texts: dict[str, str]) -> Self:
         return cls(**parts | dict(names=json.loads(texts["names"])))
 
-    def in_order(self, frames: Sequence[Any] | Mapping[str, Any]) -> tuple[Any, ...]:
+    def in_order(self, frames: Any) -> tuple[Any, ...]:
         """Frames in the order of the names.
 
         Raises:
