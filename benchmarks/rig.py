@@ -24,7 +24,8 @@ from kit.targets import RIG_TARGETS
 from kit.timing import OURS, Case, Timing, measure
 from peers import run_suite
 
-from darswin.frames import RigPlan, Sampler
+from darswin.frames import Sampler
+from darswin.frames.rig_plans import RigPlan
 
 CAREFUL, COPIED = "OpenCV in rectangles", "OpenCV, copied through masks"
 USUAL, ONE_THREAD = "four cv2.remap + NumPy", f"{OURS}, 1 thread"

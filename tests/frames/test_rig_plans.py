@@ -12,7 +12,8 @@ from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from darswin.frames import Plan, RigPlan, Sampler, _frames
+from darswin.frames import Plan, Sampler, _frames
+from darswin.frames.rig_plans import RigPlan
 
 NAMES = ("front", "left", "rear", "right", "up")
 
