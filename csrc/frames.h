@@ -54,12 +54,12 @@ struct FrameArgs {
 };
 constexpr int64_t kFrameSpare = 16;
 
-// Pixels of a rig's output that follow each other and have kRigReads reads at most, or one with
-// more, or any number of pixels without reads. The next group begins where this one ends.
+// At most kRigPixels pixels [begin, end) of a rig's output, either all with reads or all without.
+// The reads and runs of the next group follow those of this one.
 struct RigGroup {
-  int64_t pixel, read, run;
+  int64_t begin, end, read, run;
 };
-constexpr int64_t kRigReads = 256;
+constexpr int64_t kRigPixels = 256;
 
 // Reads of one source that follow each other in a group.
 struct RigRun {
@@ -76,7 +76,7 @@ struct RigArgs {
   const int16_t *columns, *rows;
   const float *right, *lower, *weights;
   const uint8_t* pixels;
-  const RigGroup* groups;  // one that begins at the end is the last
+  const RigGroup* groups;  // behind the last is one without pixels
   const RigRun* runs;
   const float *scale, *offset;  // (C,): a sum v becomes v * scale + offset
   FrameTarget to;

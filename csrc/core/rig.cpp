@@ -9,6 +9,13 @@
 #include "parallel.h"
 
 namespace darswin {
+namespace {
+
+// Rows of a tile, which is as wide as a group. Its reads are near to each other, and so in the
+// cache.
+constexpr int64_t kTileRows = 64;
+
+}  // namespace
 
 RigSampler::RigSampler(const RigPlan& plan)
     : height(plan.height),
@@ -52,22 +59,35 @@ RigSampler::RigSampler(const RigPlan& plan)
       throw std::invalid_argument("the plan's weights must be finite and not below 0");
     }
   }
-  for (size_t pixel = 0, read = 0, end, next; pixel < count; pixel = end, read = next) {
-    const bool seen = plan.counts[pixel] > 0;
-    next = read + plan.counts[pixel];
-    for (end = pixel + 1; end < count && (plan.counts[end] > 0) == seen &&
-                          next + plan.counts[end] <= read + kRigReads;) {
-      next += plan.counts[end++];
-    }
-    add_group(plan, pixel, end, read);
+  std::vector<int64_t> firsts{0};  // reads of the pixels
+  for (const uint16_t reads_of_pixel : plan.counts) {
+    firsts.push_back(firsts.back() + reads_of_pixel);
   }
-  add_group(plan, count, count, reads);
+  for (int64_t top = 0; top < height; top += kTileRows) {
+    for (int64_t left = 0; left < width; left += kRigPixels) {
+      for (int64_t row = top; row < std::min(top + kTileRows, height); ++row) {
+        add_row(plan, firsts, row * width + left, row * width + std::min(left + kRigPixels, width));
+      }
+    }
+  }
+  groups.push_back({0, 0, static_cast<int64_t>(reads), static_cast<int64_t>(runs.size())});
   for (auto* places : {&columns, &rows}) places->resize(reads + kFrameSpare);
   for (auto* numbers : {&right, &lower}) numbers->resize(reads + kFrameSpare);
 }
 
+void RigSampler::add_row(const RigPlan& plan, std::span<const int64_t> firsts, int64_t begin,
+                         int64_t end) {
+  for (int64_t next; begin < end; begin = next) {
+    const bool seen = plan.counts[begin] > 0;
+    next = begin + 1;
+    while (next < end && (plan.counts[next] > 0) == seen) ++next;
+    add_group(plan, begin, next, firsts[begin]);
+  }
+}
+
 void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read) {
-  groups.push_back({begin, read, static_cast<int64_t>(runs.size())});
+  groups.push_back(
+      {begin, end, static_cast<int64_t>(columns.size()), static_cast<int64_t>(runs.size())});
   std::vector<std::pair<int64_t, uint8_t>> reads;  // and their pixels
   for (int64_t pixel = begin; pixel < end; ++pixel) {
     for (int k = 0; k < plan.counts[pixel]; ++k) {

@@ -36,6 +36,8 @@ class RigSampler {
   void sample(std::span<const Frame> frames, void* out) const;
 
  private:
+  // Appends groups of the pixels [begin, end) of a plan; `firsts` are the first reads of all.
+  void add_row(const RigPlan& plan, std::span<const int64_t> firsts, int64_t begin, int64_t end);
   // Appends the reads of one group of pixels from a plan.
   void add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read);
 

@@ -197,26 +197,32 @@ void sample_rig(const RigArgs& a, int64_t begin, int64_t end) {
   alignas(64) float sums[3][kByteBlock];
   const int64_t reads = a.groups[end].read;
   for (const RigGroup* group = a.groups + begin; group < a.groups + end; ++group) {
-    const int64_t count = group[1].pixel - group->pixel;
+    const int64_t count = group->end - group->begin;
     if (group->run == group[1].run) {
-      write_zeros(a.to, group->pixel, count);
+      write_zeros(a.to, group->begin, count);
       continue;
     }
-    __builtin_memset(sums, 0, sizeof sums);
+    // A group of one block needs no sums.
+    const bool alone = group->run + 1 == group[1].run && a.runs[group->run].in_order &&
+                       a.runs[group->run].unweighted;
+    for (int64_t c = 0; c < a.to.channels && !alone; ++c) {
+      __builtin_memset(sums[c], 0, static_cast<size_t>(count) * sizeof(float));
+    }
     int64_t read = group->read;
     for (const RigRun* run = a.runs + group->run; run < a.runs + group[1].run; ++run) {
       for (int64_t left = run->count, next; left > 0; left -= next, read += next) {
         next = smaller(kByteBlock, left);
         fetch_ahead(a.images[run->source], a, read + kAhead, smaller(read + kAhead + next, reads));
         sample_block(a.images[run->source], a, read, next, block);
-        add_block(a, *run, read, next, block, sums);
+        if (!alone) add_block(a, *run, read, next, block, sums);
       }
     }
+    auto& found = alone ? block.samples : sums;
     for (int64_t c = 0; c < a.to.channels && a.to.output != FrameOutput::bytes; ++c) {
 #pragma omp simd
-      for (int64_t k = 0; k < count; ++k) sums[c][k] = sums[c][k] * a.scale[c] + a.offset[c];
+      for (int64_t k = 0; k < count; ++k) found[c][k] = found[c][k] * a.scale[c] + a.offset[c];
     }
-    write_block(a.to, group->pixel, count, sums);
+    write_block(a.to, group->begin, count, found);
   }
 }
 

@@ -212,9 +212,9 @@ def test_a_plan_needs_a_camera_and_pixels_can_be_blind():
 @pytest.mark.parametrize(
     ("frames", "words"),
     [
-        (FRAMES[:1], "needs 2 frames, those of front, left, got 1"),
-        (dict(front=FRAMES[0]), "no frame of the camera left"),
-        (dict(front=FRAMES[0], left=FRAMES[1], top=FRAMES[1]), "no camera top, only front, left"),
+        (FRAMES[:1], "there must be 2 frames, those of front, left, got 1"),
+        (dict(front=FRAMES[0]), "the frame of left is missing"),
+        (dict(front=FRAMES[0], left=FRAMES[1], top=FRAMES[1]), "there is no camera 'top', only front, left"),
         (FRAMES[::-1], r"frame of front must be of the plan's size, \(H, W\) = \(6, 9\)"),
         ([FRAMES[0], FRAMES[1][..., 0]], "frame of left must have the plan's 3 channels, got 1"),
         ([FRAMES[0], FRAMES[1][..., :2]], "frame of left must have shape"),
@@ -226,7 +226,7 @@ def test_wrong_frames_are_explained(frames, words):
 
 def test_other_wrong_calls_are_explained():
     sampler = Sampler(PLAN)
-    with pytest.raises(TypeError, match=r"frames must be a list .* got ndarray"):
+    with pytest.raises(TypeError, match=r"frames must be a list.* got ndarray"):
         sampler(FRAMES[0])
     with pytest.raises(TypeError, match="frame of left must be a NumPy array of uint8, got float"):
         sampler([FRAMES[0], FRAMES[1].astype(float)])
