@@ -127,7 +127,7 @@ def seen_ground(rig: Rig, windows: dict[str, np.ndarray]) -> tuple[list[float], 
         local = (points - camera.pose[:3, 3]) @ camera.pose[:3, :3]
         flat = local[:, :2] / local[:, 2:]
         low, high = windows[name][:, :2].min(0), windows[name][:, :2].max(0)
-        left[k] = (local[:, 2] > 0) & ((flat > low) & (flat < high)).all(1)
+        left[k] &= (local[:, 2] > 0) & ((flat > low) & (flat < high)).all(1)
     return tuple(
         [round(float((of.sum(0) >= count).mean()), 3) for count in (1, 2)] for of in (seen, left)
     )  # type: ignore[return-value]
