@@ -40,19 +40,24 @@ def draw_panel(figure: Figure, place: object, picture: np.ndarray, title: str, *
     axes.axis("off")
 
 
-def rendered(scope: dict, place: np.ndarray, along: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mean colours of along × along rays in each pixel of the fisheye of the page "simulator",
-    (H, W, 3), and the pixels that lie inside the image circle."""
+def rays_of(scope: dict, along: int) -> np.ndarray:
+    """along × along rays in each pixel of the fisheye of the page "simulator", in the places of a
+    larger picture, (H · along, W · along, 3); NaN outside the image circle."""
     height, width = scope["remap"].view_size
-    points = np.mgrid[: height * along, : width * along][::-1] / along + (0.5 / along - 0.5)
+    points = (np.mgrid[: height * along, : width * along][::-1] + 0.5) / along - 0.5
     lens = scope["camera"].to(torch.float64)
-    rays = lens.unproject_points(torch.from_numpy(points).movedim(0, -1)[None])[0].numpy()
+    return lens.unproject_points(torch.from_numpy(points).movedim(0, -1)[None])[0].numpy()
+
+
+def rendered(scope: dict, place: np.ndarray, along: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mean colours of these rays for each pixel, (H, W, 3), and the pixels that lie inside the
+    image circle, (H, W)."""
+    height, width = scope["remap"].view_size
+    rays = rays_of(scope, along)
     inside = np.isfinite(rays).all(-1).reshape(height, along, width, along).all((1, 3))
-    colours = [
-        scope["trace"](np.nan_to_num(part, nan=1.0), place)[0].reshape(-1, along, width, along, 3)
-        .mean((1, 3)) for part in np.split(rays, height)
-    ]  # fmt: skip
-    return np.concatenate(colours), inside
+    rows = (scope["trace"](np.nan_to_num(row, nan=1.0), place)[0] for row in np.split(rays, height))
+    means = [row.reshape(-1, along, width, along, 3).mean((1, 3)) for row in rows]
+    return np.concatenate(means), inside
 
 
 def draw_surround() -> Figure:
