@@ -130,7 +130,7 @@ def seen_ground(rig: Rig, windows: dict[str, np.ndarray]) -> tuple[list[float], 
         left[k] &= (local[:, 2] > 0) & ((flat > low) & (flat < high)).all(1)
     return tuple(
         [round(float((of.sum(0) >= count).mean()), 3) for count in (1, 2)] for of in (seen, left)
-    )  # type: ignore[return-value]
+    )
 
 
 def corner_errors(rig: Rig) -> dict[str, np.ndarray]:
