@@ -13,6 +13,7 @@ from darswin.lens.files import rigs
 from darswin.lens.ideal import Perspective
 from darswin.lens.image import Size
 from darswin.utils.angles import unit_vector
+from darswin.utils.parameters import naming
 from darswin.utils.poses import to_pose
 
 Vector = tuple[float, float, float]
@@ -167,7 +168,8 @@ class Rig:
             found = rigs.Reader(direction, cameras, coefficients, image_size).read(path)
             up = found.up if up is None else up
             if up is None and not found.in_camera:
-                raise ValueError("the file does not say which way is up in its frame: give `up`")
+                text = "the file does not say which way is up in its frame: give `up`"
+                raise naming(ValueError(text), "up")
             up = (0.0, -1.0, 0.0) if up is None else up
             forward = found.forward if forward is None else forward
             if forward is None and found.in_camera:

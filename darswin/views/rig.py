@@ -12,11 +12,10 @@ from torch import Tensor
 
 from darswin.lens.rig import Rig
 from darswin.ops import _module
-from darswin.ops.checks import per_channel
 from darswin.utils.arrays import as_tensor
 from darswin.utils.parameters import check
 from darswin.utils.tasks import IGNORE
-from darswin.views.base import Pair, PerChannel, View
+from darswin.views.base import Pair, PerChannel, View, form_of_frames
 from darswin.views.remap import Remap, aside
 from darswin.views.rig_reads import (
     Frames,
@@ -32,8 +31,8 @@ from darswin.views.rig_reads import (
 )
 
 if TYPE_CHECKING:
+    from darswin.frames import Sampler
     from darswin.frames.rig_plans import RigPlan
-    from darswin.frames.sampler import Sampler
 
 _ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
 _ONE_PLACE = 1e-6  # m
@@ -127,6 +126,11 @@ class RigRemap:
     def shown(self) -> np.ndarray:
         """The pixels of the view that show something of a picture, (H', W')."""
         return np.bincount(self.reads.pixels, minlength=self._count).reshape(self.view_size) > 0
+
+    @property
+    def seen_by(self) -> np.ndarray:
+        """Whether each of the n cameras sees each pixel of the view, (n, H', W')."""
+        return self._seen.room.reshape(-1, *self.view_size) >= 0
 
     # -- frames -------------------------------------------------------------------------------
 
@@ -314,12 +318,6 @@ class RigRemap:
         from darswin.frames.plan_files import check_size
         from darswin.frames.rig_plans import RigPlan  # the compiled module
 
-        mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
-        if output == "uint8":
-            mean, std = 0.0, 1.0
-        if mean is None or std is None:
-            raise ValueError("frames are normalized: give the mean and the std of the network")
-        channels = max(np.size(mean), np.size(std))
         sizes, reads = [check_size(c.size) for c in self.rig.cameras.values()], self.reads
         factors = np.asarray(np.ones(len(sizes)) if gains is None else gains, np.float32)
         columns, rows, right, lower = corners(reads.points, np.array(sizes)[reads.sources].T)
@@ -329,8 +327,7 @@ class RigRemap:
             sources=reads.sources, columns=columns.astype(np.int16), rows=rows.astype(np.int16),
             right=right.astype(np.float32), lower=lower.astype(np.float32),
             weights=reads.weights * factors[reads.sources], sizes=tuple(sizes),
-            names=self.rig.names, output=output, mean=per_channel("mean", mean, channels),
-            std=per_channel("std", std, channels),
+            names=self.rig.names, **form_of_frames(self.view, output, mean, std),
         )  # fmt: skip
 
     # -- of the rig alone ---------------------------------------------------------------------

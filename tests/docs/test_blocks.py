@@ -32,6 +32,7 @@ from videos import write_video
 
 from darswin import Rig, frames, lens
 from darswin.cli.main import main
+from darswin.lens.rig import CUBES
 from darswin.views import CameraView
 from darswin.viz.report import largest_offset
 
@@ -87,6 +88,9 @@ def granted(tmp_path_factory):
     picture = write_classes(folder / "photos")
     for name in ("a.jpg", "b.jpg"):
         cv2.imwrite(str(folder / name), picture)
+    (folder / "faces").mkdir()
+    for name in CUBES["carla"]:
+        cv2.imwrite(str(folder / "faces" / f"{name}.png"), cv2.resize(picture, (64, 64)))
     write_plain(folder / "garage", 20, split="train")
     write_plain(folder / "garage", 4, split="val")
     write_woodscape(folder / "woodscape", 20)
@@ -276,11 +280,11 @@ def check_detector(*after: dict) -> None:
 
 def check_simulator(*after: dict) -> None:
     """The command writes what the lines in Python write, and the page has the true numbers."""
-    rigs, (*_, scope) = importlib.import_module("rigs"), after
+    pages, (*_, scope) = importlib.import_module("rig_pages"), after
     for file in sorted(Path("fisheye").rglob("*.png")):
         same = cv2.imread(str(file).replace("fisheye", "by_command"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), same)
-    truth, inside = rigs.rendered(scope, rigs.PLACE, 8)
+    truth, inside = pages.rendered(scope, pages.PLACE, 8)
     sides = scope["remap"].reads
     seen = np.zeros((len(scope["rig"]), inside.size), bool)
     seen[sides.sources, sides.pixels] = True
@@ -288,16 +292,16 @@ def check_simulator(*after: dict) -> None:
     pictures = []
     for side in (512, 1024):
         cube = Rig.cube(side)
-        faces = [scope["render"](face, rigs.PLACE)[0] for face in cube.cameras.values()]
+        faces = [scope["render"](face, pages.PLACE)[0] for face in cube.cameras.values()]
         pictures += [
             CameraView(scope["camera"], supersampling=n).at(cube)(faces) for n in (1, None)
         ]
-    pictures += [rigs.rendered(scope, rigs.PLACE, along)[0] for along in (1, 4)]
+    pictures += [pages.rendered(scope, pages.PLACE, along)[0] for along in (1, 4)]
     errors = [(picture - truth) ** 2 for picture in pictures]
     found = [[10 * np.log10(255**2 / e[of].mean()) for of in (inside, at_seams)] for e in errors]
     np.testing.assert_allclose(numbers_of("simulator", 2), found, atol=0.1)
-    rays = rigs.rays_of(scope, 1)
-    _, labels, distance = scope["trace"](np.nan_to_num(rays, nan=1.0), rigs.PLACE)
+    rays = pages.rays_of(scope, 1)
+    _, labels, distance = scope["trace"](np.nan_to_num(rays, nan=1.0), pages.PLACE)
     same, shown = scope["labels"] == labels, scope["labels"] != 255
     assert f"{100 * same[shown].mean():.1f} % of all pixels" in page_text("simulator")
     edges = cv2.dilate(labels, np.ones((3, 3))) != cv2.erode(labels, np.ones((3, 3)))

@@ -344,7 +344,7 @@ def test_what_is_no_file_of_a_rig(tmp_path):
     for make in (chain, views, woodscape, own, colmap):
         path = written(tmp_path / "rig", make())
         options = dict(direction="camera_to_rig", image_size=SIZE)
-        refused(f"^rig {path}: .*`direction` must be None", Rig.load, path, **options)
+        refused(f"^rig {path}: .*leave out `direction`", Rig.load, path, **options)
     refused("there are no files", Rig.load, [])
     refused("No such file", Rig.load, tmp_path / "none.json", error=FileNotFoundError)
     deep = '{"a": {"pose": [1], "x": ' + "[" * 900 + "]" * 900 + "}}"

@@ -22,6 +22,7 @@ from darswin.lens.files.save import warn_of_rays_beyond
 from darswin.lens.files.woodscape import camera_to_vehicle
 from darswin.lens.image import Size
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import naming
 from darswin.utils.poses import from_quaternion, from_rotation_vector, inverse, to_pose
 from darswin.utils.text import mapping
 
@@ -115,13 +116,14 @@ class Reader(NamedTuple):
 
     def _goes(self, said: str | None) -> str:
         """The direction of poses, by the file or by the caller, not by both."""
-        if said is not None and self.direction is not None:
-            raise ValueError("the file says which way its poses go, so `direction` must be None")
-        if said is None and self.direction is None:
-            raise ValueError(
-                "the file does not say which way its poses go: give `direction`, camera_to_rig if "
-                "they take points of the camera's frame to the rig's, or rig_to_camera"
-            )
+        if (said is None) is (self.direction is None):
+            text = "the file says which way its poses go: leave out `direction`"
+            if said is None:
+                text = (
+                    "the file does not say which way its poses go: give `direction`, camera_to_rig "
+                    "if they take points of the camera's frame to the rig's, or rig_to_camera"
+                )
+            raise naming(ValueError(text), "direction")
         return str(said or self.direction)
 
     def _lens(self, text: str, name: str) -> Lens:

@@ -1,6 +1,6 @@
 """Draws docs/tutorials/simulator.png and surround.jpg from what the code of these pages makes.
 
-Run it with `.venv/bin/python docs/rigs.py`.
+Run it with `.venv/bin/python docs/rig_pages.py`.
 """
 
 import os
