@@ -98,8 +98,9 @@ def stitch(
         yaw_deg: the angle that a view of directions looks to the right of ahead, in degrees.
         pitch_deg: the angle that it looks up, in degrees.
         seam: hard: each place from one camera; narrow: mixed in the middle of an overlap; wide:
-            mixed in all of it.
-        gain: whether each camera gets a factor that makes all equally bright.
+            mixed of all that see it.
+        gain: whether each camera gets a factor that makes all equally bright. Of frames, the first
+            tells it.
     """
     from darswin.cli.pictures import claim_folder, is_below
     from darswin.cli.rig_files import files_of, read_frames
@@ -109,7 +110,7 @@ def stitch(
     cameras = open_rig(rig, up, height, direction, coefficients)
     look = Look("", fov_deg, yaw_deg, pitch_deg, None)
     shown = _view(cameras, view, size, look, span=span, center=center, rise=rise)
-    remap = shown.at(cameras, seam=seam, gain=gain, distance=distance)
+    remap = shown.at(cameras, seam=seam, distance=distance)
     frames = files_of(pictures, cameras.names)
     folder = Path(out).parent
     names = {"": Path(out).name}
@@ -122,9 +123,14 @@ def stitch(
         ending = Path(out).suffix.lower() in WRITTEN
         check("out", out, ending, f"a file that ends in one of {', '.join(sorted(WRITTEN))}")
         check_out(out, map(str, frames[""].values()))
+    sampler = None
     with Progress("stitch", len(frames)) as progress:
         for frame, files in frames.items():
-            write_image(folder / names[frame], remap(read_frames(cameras, files)))
+            pictures_of = read_frames(cameras, files)
+            # The factors of the first frame hold for all: else films would flicker.
+            if sampler is None:
+                sampler = remap.sampler(gains=remap.gains(pictures_of) if gain else None)
+            write_image(folder / names[frame], sampler(pictures_of))
             progress.done += 1
     print(f"{out}: {counted(len(frames), 'picture')}, {in_px(remap.view_size)}")
 

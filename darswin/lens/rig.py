@@ -243,22 +243,16 @@ class Rig:
         Returns:
             Pixels (n, ..., 2), NaN beyond θ_max; and whether a picture shows the point, (n, ...).
         """
-        cameras, points = self.cameras.values(), np.asarray(points, np.float64)
-        pixels = [seen_by(camera, points, 1.0) for camera in cameras]
-        shown = [is_in(at, camera.size) for at, camera in zip(pixels, cameras, strict=True)]
+        points, pixels, shown = np.asarray(points, np.float64), [], []
+        for lens, size, pose in self.cameras.values():
+            local = torch.from_numpy((points - pose[:3, 3]) @ pose[:3, :3])
+            pixels.append(lens.project_points(local[None], size)[0].numpy())
+            shown.append(is_in(pixels[-1], size))
         return np.stack(pixels), np.stack(shown)
 
     def __repr__(self) -> str:
         cameras = (f"{name}: {c.lens}, {c.size}" for name, c in self.cameras.items())
         return f"Rig({'; '.join(cameras)}; up={self.up}, forward={self.forward})"
-
-
-def seen_by(camera: Camera, points: np.ndarray, weight: float) -> np.ndarray:
-    """The pixels (..., 2) of a camera at which points of the rig's frame are seen; with a weight of
-    0, the points are directions."""
-    inverse = np.linalg.inv(camera.pose)
-    local = points @ inverse[:3, :3].T + weight * inverse[:3, 3]
-    return camera.lens.project_points(torch.from_numpy(local)[None], camera.size)[0].numpy()
 
 
 def is_in(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -22,9 +22,9 @@ from darswin.views.rig_reads import (
     Reads,
     Seam,
     Seen,
+    checked,
     corners,
     grid,
-    in_order,
     read_at,
     reads_of,
     see,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 _ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
 _ONE_PLACE = 1e-6  # m
+_RIM = 0.02  # of the room of a camera: at the rim, pixels mix with what is beyond
 _GREY = (4, 251)  # of 8 bits: what is darker or lighter says nothing about gains
 
 
@@ -62,7 +63,7 @@ class RigRemap:
         view: a `GroundView`, a `CameraView`, or a view of rays, in the rig's level frame: x right,
             y down, z ahead. Without `fov`, a view of rays shows as much as its kind usually has.
         seam: "hard" reads each point from one camera; "narrow" mixes two in the middle of their
-            overlap, and "wide" in all of it.
+            overlap, and "wide" all cameras that see it.
         gain: whether each camera gets one factor, from where the frames overlap; see `gains`.
         distance: m, of what the view shows from the middle of the rig. None is infinity: right if
             the cameras are at one place. A `GroundView` has its own.
@@ -147,7 +148,7 @@ class RigRemap:
         Raises:
             TypeError, ValueError: frames are missing, unknown, of other sizes or of unequal types.
         """
-        frames = in_order(frames, self.rig)
+        frames = checked(frames, self.rig)
         gains = self.gains(frames) if self.gain else None
         if isinstance(frames[0], Tensor):
             return self._mixed([View.floating(self.view, f, torch.float32) for f in frames], gains)
@@ -173,7 +174,7 @@ class RigRemap:
             (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where the
             view shows nothing.
         """
-        targets = in_order(targets, self.rig, maps=True)
+        targets = checked(targets, self.rig, maps=True)
         kind = targets[0].dtype.newbyteorder("=")
         picture = np.full(self._count, IGNORE if kind == np.uint8 else 0, kind)
         for target, middles in zip(targets, self._middles, strict=True):
@@ -207,7 +208,7 @@ class RigRemap:
             check(name, repr(kind), kind in ("distance", "z"), "distance or z")
         if self.view.is_surface or self.rig.spread > _ONE_PLACE:
             raise ValueError("distances are those of a view if all cameras are at its place")
-        depths = in_order(depths, self.rig, maps=True)
+        depths = checked(depths, self.rig, maps=True)
         distances = np.full(self._count, np.nan)
         for depth, middles in zip(depths, self._middles, strict=True):
             flat, width = np.ascontiguousarray(depth).ravel(), depth.shape[1]
@@ -239,13 +240,13 @@ class RigRemap:
             C) float32, from the frames of both.
         """
         values = []
-        for frame, pixels in zip(in_order(frames, self.rig), self._seen.pixels, strict=True):
+        for frame, pixels in zip(checked(frames, self.rig), self._seen.pixels, strict=True):
             images = frame
             if isinstance(frame, np.ndarray):
                 images = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None]
             read = read_at(images.detach().float(), np.nan_to_num(pixels))
             values.append(read.flatten(0, 1).T.cpu().numpy())
-        shown = self._seen.room >= 0
+        shown = self._seen.room >= _RIM
         pairs = {}
         for a, b in itertools.combinations(range(len(values)), 2):
             both = np.flatnonzero(shown[a] & shown[b])
@@ -265,7 +266,7 @@ class RigRemap:
         rows, goals = [np.ones(len(names))], [0.0]
         for (a, b), (_, (first, second)) in self.overlaps(frames).items():
             inside = np.ones(first.shape[:1], bool)
-            if in_order(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
+            if checked(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
                 both = np.concatenate((first, second), 1)
                 inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
             sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
