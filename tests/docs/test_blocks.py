@@ -7,7 +7,9 @@ parsers.
 """
 
 import ast
+import contextlib
 import importlib.util
+import io
 import json
 import re
 import runpy
@@ -28,13 +30,14 @@ from packaging.requirements import Requirement
 from scenes import write_classes, write_outlines, write_plain, write_woodscape
 from videos import write_video
 
-from darswin import frames, lens
+from darswin import Rig, frames, lens
 from darswin.cli.main import main
 from darswin.lens.rig import CUBES
+from darswin.views import CameraView
 from darswin.viz.report import largest_offset
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "studies"))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -275,6 +278,68 @@ def check_detector(*after: dict) -> None:
     assert all(np.abs(one - cv2.imread("examples/parking.jpg")).max() > 100 for one in drawn)
 
 
+def check_simulator(*after: dict) -> None:
+    """The command writes what the lines in Python write, and the page has the true numbers."""
+    pages, (*_, scope) = importlib.import_module("rig_pages"), after
+    for file in sorted(Path("fisheye").rglob("*.png")):
+        same = cv2.imread(str(file).replace("fisheye", "by_command"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), same)
+    truth, inside = pages.rendered(scope, pages.PLACE, 8)
+    sides = scope["remap"].reads
+    seen = np.zeros((len(scope["rig"]), inside.size), bool)
+    seen[sides.sources, sides.pixels] = True
+    at_seams = inside & (seen.sum(0) > 1).reshape(inside.shape)
+    pictures = []
+    for side in (512, 1024):
+        cube = Rig.cube(side)
+        faces = [scope["render"](face, pages.PLACE)[0] for face in cube.cameras.values()]
+        pictures += [
+            CameraView(scope["camera"], supersampling=n).at(cube)(faces) for n in (1, None)
+        ]
+    pictures += [pages.rendered(scope, pages.PLACE, along)[0] for along in (1, 4)]
+    errors = [(picture - truth) ** 2 for picture in pictures]
+    found = [[10 * np.log10(255**2 / e[of].mean()) for of in (inside, at_seams)] for e in errors]
+    np.testing.assert_allclose(numbers_of("simulator", 2), found, atol=0.1)
+    rays = pages.rays_of(scope, 1)
+    _, labels, distance = scope["trace"](np.nan_to_num(rays, nan=1.0), pages.PLACE)
+    same, shown = scope["labels"] == labels, scope["labels"] != 255
+    assert f"{100 * same[shown].mean():.1f} % of all pixels" in page_text("simulator")
+    edges = cv2.dilate(labels, np.ones((3, 3))) != cv2.erode(labels, np.ones((3, 3)))
+    assert same[inside & ~edges].all() and edges.mean() < 0.1
+    assert np.median(np.abs(scope["distance"] / distance - 1)[inside]) < 1e-4
+
+
+def check_surround(*after: dict) -> None:
+    """The page finds the poses of the rig, and tells how much its cameras disagree."""
+    surround, (*_, scope) = importlib.import_module("surround"), after
+    for name, camera in scope["rig"].cameras.items():
+        np.testing.assert_allclose(scope["found"][name].pose, camera.pose, atol=1e-4)
+    pairs = [("front", "left"), ("back", "left"), ("front", "right"), ("back", "right")]
+    means = [[of[pair] for of in (scope["apart"], *scope["worse"])] for pair in pairs]
+    np.testing.assert_allclose(numbers_of("surround", 3), means, atol=0.6)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        for rig in ("turned.json", "examples/surround/rig.json"):
+            main(["rig", "check", rig, "examples/surround"])
+    for said in ("left: turned by 2° to the right, pictures agree better", "no small turn or move"):
+        assert said in printed.getvalue() and said in page_text("surround").replace("\n", " ")
+    errors = surround.corner_errors(scope["rig"]).values()
+    assert [min(map(len, errors)), max(map(len, errors))] == [35, 53]
+    medians = [np.median(of) for of in errors]
+    assert [min(medians), max(medians)] == pytest.approx([1.8, 2.8], abs=0.1)
+    assert max(np.quantile(of, 0.9) for of in errors) < 7
+
+
+def page_text(tutorial: str) -> str:
+    return (ROOT / "docs/tutorials" / f"{tutorial}.md").read_text()
+
+
+def numbers_of(tutorial: str, columns: int) -> list[list[float]]:
+    """The rows of a page's table whose last columns are numbers."""
+    rows = [line.strip("| ").split(" | ")[-columns:] for line in page_text(tutorial).splitlines()]
+    return [[float(n) for n in row] for row in rows if all(re.fullmatch(r"[\d.]+", n) for n in row)]
+
+
 def check_yolo(*after: dict) -> None:
     """One command finds things on both cameras, and both data sets have labels in tiles."""
     pictures = json.loads(Path("found/predictions.json").read_text())
@@ -318,5 +383,7 @@ RESULTS: dict[str, Callable] = {
     "answers": check_answers,
     "detector": check_detector,
     "sampling": check_sampling,
+    "simulator": check_simulator,
+    "surround": check_surround,
     "yolo": check_yolo,
 }
