@@ -2,6 +2,8 @@
 
 import contextlib
 import itertools
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -151,6 +153,15 @@ def relative_error(got, expected):
 def in_this_process(work, jobs, *_):
     """In place of `run_all` of the studies, which runs jobs in processes of their own."""
     return [work(*job) for job in jobs]
+
+
+def output(*command, **options) -> str:
+    """What a command prints; it must succeed."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path} | options.pop("env", {})
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def ended(capsys, code, function, *arguments, **options):
