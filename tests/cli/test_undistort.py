@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import save_picture
+from lens_examples import write_opencv
 from PIL import Image
 from videos import write_video
 
@@ -38,13 +39,8 @@ def read(path):
 @pytest.fixture
 def folder(tmp_path):
     """A folder with a calibration of OpenCV's fisheye model and a picture."""
-    file = cv2.FileStorage(str(tmp_path / "fisheye.yaml"), cv2.FILE_STORAGE_WRITE)
-    file.write("image_width", SIZE[1])
-    file.write("image_height", SIZE[0])
-    file.write("fisheye_model", 1)
-    file.write("camera_matrix", K)
-    file.write("distortion_coefficients", D)
-    file.release()
+    entries = dict(image_width=SIZE[1], image_height=SIZE[0], fisheye_model=1, camera_matrix=K)
+    write_opencv(tmp_path / "fisheye.yaml", **entries, distortion_coefficients=D)
     save_picture(tmp_path / "in" / "a.png", picture())
     return tmp_path
 
