@@ -171,7 +171,6 @@ struct PolarCall {
     // If there are points, the kernels write every pixel.
     const Tensor grad =
         points() ? new_tensor(image.sizes(), image.scalar_type()) : new_zeros(image, image.sizes());
-    ask_for_large_pages(grad);
     args.grad_image = grad.mutable_data_ptr();
     return grad;
   }

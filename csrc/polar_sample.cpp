@@ -38,7 +38,6 @@ Tensor forward(PolarCall<T>& call, bool tokens) {
   choose_layout(args, tokens);
   const Tensor out = new_tensor(output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
-  ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels<PolarSampleKernels<T>>();
   run_with_scratch(call.batch * call.rings(), threads_for(call.microseconds()),

@@ -12,7 +12,6 @@ Tensor forward(AttentionCall<T>&& call) {
   auto& args = call.args;
   const Tensor out = new_tensor(call.output_sizes(), call.qkv.scalar_type());
   if (out.numel() == 0) return out;
-  ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
   call.run(args.windows * args.heads, 2, kernels<WindowAttentionKernels<T>>().forward);
   return out;
@@ -35,7 +34,6 @@ std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
   grad_out = checked_gradient(grad_out, call.output_sizes(), call.qkv.scalar_type(), kAttention);
   const Tensor grad_qkv = new_tensor(call.qkv.sizes(), call.qkv.scalar_type());
   if (grad_qkv.numel() == 0) return {grad_qkv, new_zeros(call.bias, call.bias.sizes())};
-  ask_for_large_pages(grad_qkv);
   args.chunk = chunk_size(args);
   const int64_t chunks = units(args.windows / args.bias_rows, args.chunk);
   const int64_t row = call.bias.numel();
