@@ -34,7 +34,7 @@ inline MaybeTensor as_contiguous(const MaybeTensor& tensor) {
   return tensor ? MaybeTensor(as_contiguous(*tensor)) : tensor;
 }
 
-// Returns a contiguous tensor on the CPU whose values are not initialized.
+// Returns a contiguous tensor on the CPU whose values are not initialized, in large pages.
 inline Tensor new_tensor(IntHeaderOnlyArrayRef sizes, ScalarType type) {
   Sizes strides(sizes.size(), 1);
   for (size_t axis = sizes.size(); axis > 1; --axis) {
@@ -47,11 +47,9 @@ inline Tensor new_tensor(IntHeaderOnlyArrayRef sizes, ScalarType type) {
       static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(),
       torch::stable::detail::to<int32_t>(torch::stable::detail::from(type)),
       aoti_torch_device_type_cpu(), 0, &made));
-  return Tensor(made);
-}
-
-inline void ask_for_large_pages(const Tensor& tensor) {
+  const Tensor tensor(made);
   ask_for_large_pages(tensor.mutable_data_ptr(), tensor.numel() * tensor.element_size());
+  return tensor;
 }
 
 // Stands for a gradient that is not wanted: an empty tensor.

@@ -10,7 +10,7 @@
 #include "core/parallel.h"
 
 // The arguments that polar_sample and its backward share. Their order is that of the fields of
-// struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
+// struct Sampling (polar_sample.cpp) and of darswin.ops._sampling.Sampling.
 #define SAMPLING                                                                                  \
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
   "Tensor? jitter, Tensor? seed, int[] samples, float[] mean, float[] std, bool bfloat16"

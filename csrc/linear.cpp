@@ -134,7 +134,6 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor n
   }
   sizes.back() = columns;
   const Tensor out = new_tensor(sizes, ScalarType::Float);
-  ask_for_large_pages(out);
   multiply(x.const_data_ptr(), rows, layer, out.mutable_data_ptr(),
            gelu ? After::gelu : After::nothing);
   return out;

@@ -128,7 +128,6 @@ Tensor forward(ToImageCall<T>&& call) {
   auto& args = call.args;
   const Tensor out = new_tensor(call.output_sizes(), call.x.scalar_type());
   if (out.numel() == 0) return out;
-  ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
   run_polar_to_image(args);
   return out;
@@ -152,7 +151,6 @@ Tensor map_gradient(ToImageCall<T>& call) {
   const int64_t pixels = args.height * args.width;
   if (call.x.numel() == 0 || pixels == 0) return new_zeros(call.x, call.x.sizes());
   const Tensor grad = new_tensor(call.x.sizes(), call.x.scalar_type());
-  ask_for_large_pages(grad);
   args.grad_x = mutable_pointer<T>(grad);
   args.bands = count_bands(args);
   const Tensor partial =

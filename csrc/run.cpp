@@ -68,7 +68,6 @@ std::vector<Tensor> run(std::vector<Tensor> inputs, int64_t number) {
     Sizes sizes = network.output_shape(k);
     sizes.insert(sizes.begin(), batch);
     outputs.push_back(new_tensor(sizes, ScalarType::Float));
-    ask_for_large_pages(outputs.back());
     results.push_back(mutable_pointer<float>(outputs.back()));
   }
   network.run(batch, given.data(), results.data());

@@ -190,7 +190,6 @@ Tensor linear(Tensor x, Tensor weight, MaybeTensor bias) {
   const Tokens tokens(x, kLinear);
   const Weights layer(weight, bias, tokens.dim, kLinear);
   const Tensor out = new_tensor(tokens.sizes(layer.columns), ScalarType::Float);
-  ask_for_large_pages(out);
   multiply_by(layer.packed(), pointer<float>(tokens.x), tokens.rows, layer.depth, layer.columns,
               mutable_pointer<float>(out));
   return out;
@@ -207,7 +206,6 @@ std::tuple<Tensor, Tensor, Tensor> linear_backward(Tensor x, Tensor weight, Mayb
   const Tensor grad_x = new_gradient(x_grad, x, rows);
   const Tensor grad_weight = new_gradient(weight_grad || bias_grad, weight, rows);
   const Tensor grad_bias = new_gradient(bias_grad, bias, rows);
-  ask_for_large_pages(grad_x);
   const MaybeTensor back = x_grad ? MaybeTensor(layer.transposed()) : std::nullopt;
   for_parts(rows, depth + columns, [&](int64_t begin, int64_t count) {
     const auto* const grad = pointer<float>(grad_out) + begin * columns;
@@ -245,7 +243,6 @@ std::tuple<Tensor, Tensor> mlp(Tensor x, Tensor weight1, Tensor bias1, Tensor we
   const int64_t depth = first.depth, width = first.columns, columns = second.columns;
   const Tensor out = new_tensor(tokens.sizes(columns), ScalarType::Float);
   const Tensor hidden = new_tensor(tokens.sizes(width), ScalarType::Float);
-  ask_for_large_pages(out), ask_for_large_pages(hidden);
   const Tensor packed1 = first.packed(), packed2 = second.packed();
   const Tensor scratch = part_of(tokens.rows, width);
   auto* const activated = mutable_pointer<float>(scratch);
@@ -278,7 +275,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> mlp_backward(Tensor x, Tensor
   const auto grads = [&](const Tensor& like) { return new_gradient(true, like, rows); };
   const Tensor grad_x = grads(x), grad_weight1 = grads(weight1), grad_bias1 = grads(bias1),
                grad_weight2 = grads(weight2), grad_bias2 = grads(bias2);
-  ask_for_large_pages(grad_x);
   const Tensor back1 = first.transposed(), back2 = second.transposed();
   const Tensor scratch1 = part_of(rows, width), scratch2 = part_of(rows, width);
   auto *const activated = mutable_pointer<float>(scratch1), *const derived =

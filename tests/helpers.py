@@ -2,12 +2,15 @@
 
 import contextlib
 import itertools
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from allpairspy import AllPairs
+from PIL import ExifTags, Image
 from safetensors.torch import load_file
 
 from darswin import create_model
@@ -151,6 +154,28 @@ def relative_error(got, expected):
 def in_this_process(work, jobs, *_):
     """In place of `run_all` of the studies, which runs jobs in processes of their own."""
     return [work(*job) for job in jobs]
+
+
+def exif_of(orientation):
+    """EXIF data by which a picture is turned upright."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    return exif
+
+
+def save_picture(path, pixels, **options):
+    """Writes a grey or RGB picture, and makes its folder."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels.squeeze()).save(path, **options)
+
+
+def output(*command, **options) -> str:
+    """What a command prints; it must succeed."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path} | options.pop("env", {})
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def ended(capsys, code, function, *arguments, **options):

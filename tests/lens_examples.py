@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import yaml
@@ -55,6 +56,15 @@ K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
 FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
 PLUMB_BOB = [-0.22, 0.05, 0.001, -0.002, 0.003]
 RATIONAL = [0.2, 0.05, 0.001, -0.002, 0.003, 0.25, 0.04, 0.002]
+
+
+def write_opencv(path, mode=cv2.FILE_STORAGE_WRITE, **entries):
+    """A file written by OpenCV's FileStorage, in the notation of its suffix."""
+    storage = cv2.FileStorage(str(path), mode)
+    for name, value in entries.items():
+        storage.write(name, np.asarray(value, float) if isinstance(value, list) else value)
+    storage.release()
+    return path
 
 
 def opencv(**entries):

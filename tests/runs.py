@@ -1,5 +1,6 @@
 """Shared by the tests of runs: tiny runs of each task in this process, kills, and their files."""
 
+import csv
 import itertools
 import json
 from pathlib import Path
@@ -51,6 +52,11 @@ def error(capsys, *argv) -> str:
 
 def checkpoint(run: Path, name: str = "last") -> dict:
     return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def table(file: Path) -> list[dict[str, str]]:
+    with file.open() as lines:
+        return list(csv.DictReader(lines))
 
 
 def files(folder: Path) -> dict[str, bytes]:

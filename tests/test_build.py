@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import sysconfig
 import tarfile
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from graphs import write_constants
+from helpers import output
 from scenes import write_classes, write_outlines, write_rooms
 from torch_abi_audit import inspect_extension
 
@@ -25,15 +25,6 @@ from darswin.frames import _frames
 from darswin.ops import _module, cpu_capability, polar_sample
 
 ROOT = Path(__file__).parent.parent
-
-
-def output(*command, **options) -> str:
-    """What a command prints; it must succeed."""
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path} | options.pop("env", {})
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, **options)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 def test_the_tier_in_use_is_the_one_asked_for():

@@ -2,12 +2,12 @@
 
 import ast
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import output
 
 import darswin
 
@@ -27,10 +27,8 @@ command.load()({})
 def loaded(code: str) -> set[str]:
     """The names of the modules that a new Python process has loaded after running the code."""
     report = "import json, sys; print(); print(json.dumps([*sys.modules]))"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
-    )
-    return set(json.loads(done.stdout.splitlines()[-1]))
+    *_, names = output(sys.executable, "-c", f"{code}\n{report}").splitlines()
+    return set(json.loads(names))
 
 
 @pytest.mark.slow

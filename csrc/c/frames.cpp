@@ -5,6 +5,7 @@
 #include <stdexcept>
 #include <string>
 #include <system_error>
+#include <type_traits>
 #include <vector>
 
 #include "../core/network_file.h"
@@ -20,9 +21,9 @@ namespace {
 
 thread_local std::string last_error;
 
-// The result of `body`, or `failed` if it throws.
-template <typename Body, typename Result>
-Result caught(Body body, Result failed) noexcept {
+// The result of `body`; if it throws, NULL for a pointer, else -1.
+template <typename Body>
+auto caught(Body body) noexcept {
   try {
     return body();
   } catch (const std::exception& error) {
@@ -34,7 +35,12 @@ Result caught(Body body, Result failed) noexcept {
   } catch (...) {
     last_error.clear();
   }
-  return failed;
+  using Result = decltype(body());
+  if constexpr (std::is_pointer_v<Result>) {
+    return Result{nullptr};
+  } else {
+    return Result{-1};
+  }
 }
 
 void require(bool condition, const char* what) {
@@ -64,87 +70,74 @@ DARSWIN_API const char* darswin_file_version() {
 DARSWIN_API const char* darswin_last_error() { return last_error.c_str(); }
 
 DARSWIN_API darswin_network* darswin_load(const char* path) {
-  return caught(
-      [&] {
-        require(path != nullptr, "path must not be NULL");
-        try {
-          return new darswin_network(path);
-        } catch (const std::system_error& error) {
-          throw std::runtime_error(std::string(path) + ": " + error.code().message());
-        }
-      },
-      static_cast<darswin_network*>(nullptr));
+  return caught([&] {
+    require(path != nullptr, "path must not be NULL");
+    try {
+      return new darswin_network(path);
+    } catch (const std::system_error& error) {
+      throw std::runtime_error(std::string(path) + ": " + error.code().message());
+    }
+  });
 }
 
 DARSWIN_API void darswin_free(darswin_network* network) { delete network; }
 
 DARSWIN_API int darswin_frame_size(const darswin_network* network, int64_t size[3]) {
-  return caught(
-      [&] {
-        require(size != nullptr, "size must not be NULL");
-        size[0] = given(network).height();
-        size[1] = network->width(), size[2] = network->channels();
-        return 0;
-      },
-      -1);
+  return caught([&] {
+    require(size != nullptr, "size must not be NULL");
+    size[0] = given(network).height();
+    size[1] = network->width(), size[2] = network->channels();
+    return 0;
+  });
 }
 
 DARSWIN_API int64_t darswin_output_count(const darswin_network* network) {
-  return caught([&] { return given(network).output_count(); }, int64_t{-1});
+  return caught([&] { return given(network).output_count(); });
 }
 
 DARSWIN_API const int64_t* darswin_output_shape(const darswin_network* network, int64_t output) {
-  return caught([&] { return shape_of(network, output).data(); },
-                static_cast<const int64_t*>(nullptr));
+  return caught([&] { return shape_of(network, output).data(); });
 }
 
 DARSWIN_API int64_t darswin_output_axes(const darswin_network* network, int64_t output) {
-  return caught([&] { return static_cast<int64_t>(shape_of(network, output).size()); },
-                int64_t{-1});
+  return caught([&] { return static_cast<int64_t>(shape_of(network, output).size()); });
 }
 
 DARSWIN_API int64_t darswin_output_numbers(const darswin_network* network, int64_t output) {
-  return caught(
-      [&] {
-        int64_t numbers = 1;
-        for (const int64_t size : shape_of(network, output)) numbers *= size;
-        return numbers;
-      },
-      int64_t{-1});
+  return caught([&] {
+    int64_t numbers = 1;
+    for (const int64_t size : shape_of(network, output)) numbers *= size;
+    return numbers;
+  });
 }
 
 DARSWIN_API int64_t darswin_label_count(const darswin_network* network) {
-  return caught([&] { return static_cast<int64_t>(given(network).labels().size()); }, int64_t{-1});
+  return caught([&] { return static_cast<int64_t>(given(network).labels().size()); });
 }
 
 DARSWIN_API const char* darswin_label(const darswin_network* network, int64_t label) {
-  return caught(
-      [&] {
-        const auto& labels = given(network).labels();
-        require(label >= 0 && label < static_cast<int64_t>(labels.size()),
-                "there is no such label");
-        return labels[label].c_str();
-      },
-      static_cast<const char*>(nullptr));
+  return caught([&] {
+    const auto& labels = given(network).labels();
+    require(label >= 0 && label < static_cast<int64_t>(labels.size()), "there is no such label");
+    return labels[label].c_str();
+  });
 }
 
 DARSWIN_API int darswin_run(const darswin_network* network, const darswin_frame* frame,
                             float* const* outputs, int64_t threads) {
-  return caught(
-      [&] {
-        require(frame != nullptr && frame->pixels != nullptr && outputs != nullptr,
-                "frame, its pixels and outputs must not be NULL");
-        require(threads >= 1, "threads must be at least 1");
-        for (int64_t k = 0; k < given(network).output_count(); ++k) {
-          require(outputs[k] != nullptr, "outputs must not be NULL");
-        }
-        const darswin::Frame pixels{frame->pixels,        frame->height,     frame->width,
-                                    frame->channels,      frame->row_stride, frame->column_stride,
-                                    frame->channel_stride};
-        network->check(pixels);
-        const darswin::ThreadLimit limit(threads);
-        network->run(pixels, outputs);
-        return 0;
-      },
-      -1);
+  return caught([&] {
+    require(frame != nullptr && frame->pixels != nullptr && outputs != nullptr,
+            "frame, its pixels and outputs must not be NULL");
+    require(threads >= 1, "threads must be at least 1");
+    for (int64_t k = 0; k < given(network).output_count(); ++k) {
+      require(outputs[k] != nullptr, "outputs must not be NULL");
+    }
+    const darswin::Frame pixels{frame->pixels,        frame->height,     frame->width,
+                                frame->channels,      frame->row_stride, frame->column_stride,
+                                frame->channel_stride};
+    network->check(pixels);
+    const darswin::ThreadLimit limit(threads);
+    network->run(pixels, outputs);
+    return 0;
+  });
 }

@@ -125,13 +125,21 @@ void Network::check_memory() {
   }
 }
 
-// Throws unless a slot exists, has room for these numbers, and is a buffer if it is written.
-void Network::fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const {
-  const int64_t first = input_count();
-  require(slot >= (writes ? first : 0) && slot < first + static_cast<int64_t>(buffers.size()),
+int64_t Network::numbers(int64_t slot) const {
+  return slot < input_count() ? inputs[slot] : buffers[slot - input_count()];
+}
+
+// The numbers of a slot. Throws unless it exists, and is a buffer if it is written.
+int64_t Network::numbers_at(int64_t slot, bool writes) const {
+  require(slot >= (writes ? input_count() : 0) && slot < slots(),
           "names a slot that it does not have");
-  require(product(sizes) == (slot < first ? inputs[slot] : buffers[slot - first]),
-          "uses a slot of another size");
+  return numbers(slot);
+}
+
+// Throws unless a slot also has room for these numbers.
+void Network::fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const {
+  const int64_t held = numbers_at(slot, writes);
+  require(product(sizes) == held, "uses a slot of another size");
 }
 
 Layer Network::layer_at(int64_t offset, int64_t depth, int64_t columns,
@@ -228,14 +236,8 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       break;
     case Opcode::copy: {
       apart();
-      const int64_t slots[] = {a[0], a[1]};
       for (int side = 0; side < 2; ++side) {
-        const int64_t slot = slots[side], first = input_count();
-        require(
-            slot >= (side == 0 ? 0 : first) && slot < first + static_cast<int64_t>(buffers.size()),
-            "names a slot that it does not have");
-        const int64_t* sizes = a + 4;
-        const int64_t numbers = slot < first ? inputs[slot] : buffers[slot - first];
+        const int64_t *sizes = a + 4, numbers = numbers_at(a[side], side == 1);
         int64_t last = a[2 + side];
         require(last >= 0 && last < numbers, "copies beyond a slot");
         for (int axis = 0; axis < kCopyAxes; ++axis) {
@@ -250,14 +252,10 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
       }
       break;
     }
-    case Opcode::add: {
+    case Opcode::add:
       apart();
-      const int64_t first = input_count(), to = a[1] - first;
-      require(to >= 0 && to < static_cast<int64_t>(buffers.size()),
-              "names a slot that it does not have");
-      fits(a[0], {buffers[to]}, false);
+      fits(a[0], {numbers_at(a[1], true)}, false);
       break;
-    }
     case Opcode::mean:
       apart();
       fits(a[0], {a[2], a[3]}, false);
@@ -266,8 +264,7 @@ Network::Step Network::checked(Opcode opcode, const int64_t* a) const {
     case Opcode::apply:
     case Opcode::distance:
       require(opcode == Opcode::distance || follows(a[1]), "has an unknown function");
-      require(a[0] >= input_count() && a[0] < input_count() + static_cast<int64_t>(buffers.size()),
-              "names a slot that it does not have");
+      numbers_at(a[0], true);
       break;
     case Opcode::conv:
       apart();

@@ -89,6 +89,9 @@ class Network {
   Norm norm_at(int64_t offset, int64_t dim) const;
   const float* weights_at(int64_t offset, int64_t count) const;
   Block block_of(const int64_t* arguments) const;
+  int64_t slots() const { return input_count() + static_cast<int64_t>(buffers.size()); }
+  int64_t numbers(int64_t slot) const;  // for one image
+  int64_t numbers_at(int64_t slot, bool writes) const;
   void fits(int64_t slot, std::initializer_list<int64_t> sizes, bool writes) const;
   void check_memory();
 

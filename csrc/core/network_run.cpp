@@ -76,10 +76,7 @@ struct Network::Run {
   std::vector<float*> to;     // null for inputs
   std::vector<int64_t> rows;  // batch, or 1 for all images
 
-  int64_t numbers(int64_t slot) const {
-    const int64_t first = network.input_count();
-    return slot < first ? network.inputs[slot] : network.buffers[slot - first];
-  }
+  int64_t numbers(int64_t slot) const { return network.numbers(slot); }
   // The numbers from one image to the next.
   int64_t stride(int64_t slot) const { return rows[slot] == 1 ? 0 : numbers(slot); }
   const float* image(int64_t slot, int64_t b) const { return from[slot] + b * stride(slot); }
@@ -325,9 +322,8 @@ struct Network::Run {
 void Network::run(int64_t batch, const Input* given, float* const* results) const {
   if (batch == 0) return;
   if (batch > kMostNumbers / total) throw std::invalid_argument("the batch is too large");
-  const int64_t slots = input_count() + static_cast<int64_t>(buffers.size());
-  Run run{*this, batch, std::vector<const float*>(slots), std::vector<float*>(slots),
-          std::vector<int64_t>(slots, batch)};
+  Run run{*this, batch, std::vector<const float*>(slots()), std::vector<float*>(slots()),
+          std::vector<int64_t>(slots(), batch)};
   for (int64_t k = 0; k < input_count(); ++k) {
     if (given[k].rows != 1 && given[k].rows != batch) {
       throw std::invalid_argument("input " + std::to_string(k) +
@@ -340,7 +336,7 @@ void Network::run(int64_t batch, const Input* given, float* const* results) cons
   const auto size = [&](int64_t slot) {
     return round_up(batch * run.numbers(slot) * static_cast<int64_t>(sizeof(float)), 64);
   };
-  for (int64_t slot = input_count(); slot < slots; ++slot) {
+  for (int64_t slot = input_count(); slot < slots(); ++slot) {
     if (run.to[slot] == nullptr) bytes += size(slot);
   }
   for (const Step& step : steps) scratch_bytes = std::max(scratch_bytes, run.scratch(step));
@@ -348,7 +344,7 @@ void Network::run(int64_t batch, const Input* given, float* const* results) cons
   const ThreadMemoryOf<1> memory(bytes);
   const ThreadMemoryOf<2> scratch(scratch_bytes);
   auto* next = static_cast<char*>(memory.get());
-  for (int64_t slot = input_count(); slot < slots; ++slot) {
+  for (int64_t slot = input_count(); slot < slots(); ++slot) {
     if (run.to[slot] == nullptr) {
       run.to[slot] = reinterpret_cast<float*>(next);
       next += size(slot);

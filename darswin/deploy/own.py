@@ -31,11 +31,10 @@ _LINEAR = own_operator("_linear")
 
 def packed_weights(linear: Any) -> Tensor:
     """A linear layer as `_linear` reads it, (K,): float32, or int32 if quantized."""
-    weight = linear.weight.detach()
-    bias = None if linear.bias is None else linear.bias.detach().float()
     if (taken := quantized_layers(linear).get("")) is not None:
-        return _PACK(weight, bias, linear.weight_scale.float(), *taken)
-    return _PACK(weight.float(), bias)
+        bias = None if linear.bias is None else linear.bias.detach().float()
+        return _PACK(linear.weight.detach(), bias, linear.weight_scale.float(), *taken)
+    return pack(linear.weight, linear.bias)
 
 
 def norm_parameters(norm: nn.LayerNorm) -> Tensor:
@@ -69,11 +68,9 @@ class OwnNorm:
     """A layer norm by our own operators."""
 
     def __init__(self, norm: nn.LayerNorm):
-        self.eps = norm.eps
-        eps = torch.tensor([norm.eps])
+        self.eps, self.parameters = norm.eps, norm_parameters(norm)
         # As the programs of networks have it: the weight, the bias and eps.
-        self.words = torch.cat((norm_parameters(norm).flatten(), eps))
-        self.parameters = norm_parameters(norm)
+        self.words = torch.cat((self.parameters.flatten(), torch.tensor([norm.eps])))
 
     def __call__(self, x: Tensor) -> Tensor:
         if has_torch_function_unary(x):

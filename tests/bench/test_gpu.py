@@ -1,12 +1,11 @@
 """`make gpu` without a GPU: on an imitation of one, and with parts of the test's own."""
 
 import json
-import subprocess
 import sys
 
 import gpu
 import pytest
-from helpers import refused
+from helpers import output, refused
 
 
 def found(folder):
@@ -44,9 +43,7 @@ def test_failures_and_what_is_left_out_are_told(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_every_part_on_another_device(tmp_path):
-    command = [sys.executable, gpu.__file__, "--device=other", "--quick", f"--out={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    output(sys.executable, gpu.__file__, "--device=other", "--quick", f"--out={tmp_path}")
     record = found(tmp_path)
     assert {c["part"] for c in record["checks"] if c["state"] == "passed"} == {*gpu.PARTS}
     assert len(record["timings"]) == 4 and min(record["accuracy"]["DarSwin-A"].values()) > 20

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import refused, save_picture
 from PIL import Image
 from videos import write_video
 
@@ -115,11 +115,6 @@ def picture_of(labels):
     return np.take(np.array(COLORS, np.uint8), labels, 0)
 
 
-def write(name, image):
-    Path(name).parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(name, image[..., ::-1])
-
-
 @pytest.fixture
 def labels():
     """Large regions; one class is nowhere."""
@@ -148,7 +143,7 @@ def colored(path):
 def test_labels_of_a_picture(stub, labels):
     stub("segmentation")
     image = picture_of(labels)
-    write("p.png", image)
+    save_picture("p.png", image)
     (answer,) = predict("p.png")
     assert answer["image"] == "p.png"
     assert (answer["labels"], answer["overlay"]) == ("labels/p.png", "overlays/p.jpg")
@@ -172,7 +167,7 @@ def test_labels_of_a_picture(stub, labels):
 def test_distances_of_a_picture(stub):
     stub("distance")
     red = np.tile(np.linspace(40, 240, 64).astype(np.uint8), (48, 1))
-    write("p.png", np.stack((red, red, red), -1))
+    save_picture("p.png", np.stack((red, red, red), -1))
     (answer,) = predict("p.png --task distance")
     assert answer["distance"] == "distance/p.png"
     steps = cv2.imread("out/distance/p.png", cv2.IMREAD_UNCHANGED)
@@ -212,7 +207,7 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, task, value):
 
     monkeypatch.setattr(net, "run", broken)
     for name in ("0.png", "1.png"):
-        write(name, np.full((48, 64, 3), 50, np.uint8))
+        save_picture(name, np.full((48, 64, 3), 50, np.uint8))
     with pytest.raises(SystemExit, match=r"darswin: no prediction for 1\.png: .* NaN or"):
         predict("0.png 1.png")
     found = json.loads(Path("out/predictions.json").read_text())
@@ -224,7 +219,7 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, task, value):
 def test_a_folder_means_pictures_and_videos(stub, labels, capsys):
     net = stub("segmentation")
     for name in ("front/1.png", "rear/1.png", "rear/deep/2.jpg"):
-        write(f"in/{name}", picture_of(labels if "front" in name else labels[:, ::-1]))
+        save_picture(f"in/{name}", picture_of(labels if "front" in name else labels[:, ::-1]))
     frames = write_video(Path("in/rear/drive.avi"), 5, size=(48, 64), codec="MJPG")
     Path("out").symlink_to("in/out")
     Path("in/out").mkdir()
@@ -250,7 +245,7 @@ def test_a_folder_means_pictures_and_videos(stub, labels, capsys):
 def test_colours_of_distance_stay_for_a_video(stub):
     stub("distance")
     write_video(Path("v.avi"), 4, size=(48, 64), codec="MJPG")
-    write("p.png", np.full((48, 64, 3), 40, np.uint8))
+    save_picture("p.png", np.full((48, 64, 3), 40, np.uint8))
     *frames, _, picture = predict("v.avi p.png")
     assert len({tuple(answer["colors_m"]) for answer in frames}) == 1
     assert picture["colors_m"] != frames[0]["colors_m"]
@@ -288,7 +283,7 @@ def test_a_record_of_another_program_is_not_replaced(tmp_path):
 
 def test_more_classes_than_a_png_holds_are_refused(stub, labels):
     stub("segmentation").num_classes = 256
-    write("p.png", picture_of(labels))
+    save_picture("p.png", picture_of(labels))
     refused("at most 255 classes, got 256", predict, "p.png", error=SystemExit)
 
 
@@ -301,7 +296,7 @@ def test_a_real_model_answers_as_in_python(tmp_path, monkeypatch):
     save_model("m.safetensors", model.state_dict(), card)
     rng = np.random.default_rng(0)
     image = cv2.resize(rng.integers(256, size=(9, 12, 3), dtype=np.uint8), (160, 140))
-    write("p.png", image)
+    save_picture("p.png", image)
     lens = LENS | {"image_size": [140, 160]}
     predict("p.png", lens)
     remap = fitted((140, 160), 128, "crop").at(from_dict(lens), (140, 160))
@@ -313,7 +308,7 @@ def test_a_real_model_answers_as_in_python(tmp_path, monkeypatch):
 def test_a_model_that_takes_squares_says_what_it_does_not_see(stub, labels, capsys):
     """Once, whatever it was trained on; only the old file's card asks for a new training."""
     for k in range(3):
-        write(f"in/{k}.png", picture_of(labels))
+        save_picture(f"in/{k}.png", picture_of(labels))
     lens = {"model": "Equidistant", "focal": 30, "theta_max": 1.5, "image_size": [48, 64]}
     for fit, reason in (
         ("crop", "it was trained on cropped pictures; `darswin fit --data.fit stretch` trains one"),

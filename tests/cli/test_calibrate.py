@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 from calibrate_boards import Renderer
-from helpers import ended, slow_but
-from PIL import ExifTags, Image
+from helpers import ended, exif_of, slow_but
+from PIL import Image
 
 from darswin import lens
 from darswin.calibrate import Board, find_corners
@@ -110,10 +110,8 @@ def test_any_format_is_written_and_models_are_compared(folder, capsys, monkeypat
 def test_a_folder_as_people_have_it(folder, capsys, monkeypatch, orientation):
     """Pixels are those that the camera stores, whatever EXIF says of some pictures. One is blurred,
     one has no text as its name, one is there twice, one is given twice, and two are broken."""
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
     for k in range(0, 9, 2):
-        Image.open(f"boards/{k}.png").save(f"boards/{k}.png", exif=exif)
+        Image.open(f"boards/{k}.png").save(f"boards/{k}.png", exif=exif_of(orientation))
     stored = cv2.imread("boards/4.png", cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR_RGB)
     cv2.imwrite("boards/7.png", cv2.GaussianBlur(cv2.imread("boards/7.png"), (0, 0), 2.0))
     name = os.fsdecode(b"boards/\xff.png")
@@ -157,10 +155,9 @@ def test_a_video_is_read_by_its_sharpest_frames(folder, capsys):
 
 def test_markers_are_found_in_pictures_that_the_camera_mirrors(folder, capsys):
     calibrate("markers", *CHARUCO, "--out=plain.json")
-    exif = Image.Exif()
     for orientation, file in zip((2, 4, 5, 7), (folder / "markers").iterdir(), strict=True):
-        exif[ExifTags.Base.Orientation] = orientation
-        Image.open(file).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(file, exif=exif)
+        mirrored = Image.open(file).transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+        mirrored.save(file, exif=exif_of(orientation))
     calibrate("markers", *CHARUCO)
     printed = capsys.readouterr().out
     assert printed.count("pictures        4 of 4") == 2 and "mirrored" not in printed

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import ended
-from PIL import ExifTags, Image
+from helpers import ended, exif_of, save_picture
+from PIL import Image
 from videos import turn_video, write_video
 
 from darswin.cli.main import main
@@ -144,11 +144,7 @@ def assert_same(command, found, expected, apart=None):
 
 
 def put(name, array, orientation=1):
-    exif = Image.Exif()
-    if orientation != 1:
-        exif[ExifTags.Base.Orientation] = orientation
-    Path(name).parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(array).save(name, exif=exif)
+    save_picture(name, array, exif=Image.Exif() if orientation == 1 else exif_of(orientation))
 
 
 def write_set():

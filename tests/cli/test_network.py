@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import refused, slow_but
+from helpers import refused, save_picture, slow_but
 from PIL import Image
 
 pytest.importorskip("onnx")
@@ -68,11 +68,6 @@ def disc_at(place, channel=1, lens=WIDE):
     return picture, np.concatenate((points[0].min(0), points[0].max(0))) + 0.5
 
 
-def write(name, picture):
-    Path(name).parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(name, picture[..., ::-1])
-
-
 def predict(command, lens=WIDE):
     main(["predict", *command.split(), "--lens", json.dumps(lens), "--out", "out"])
     return json.loads(Path("out/predictions.json").read_text())
@@ -82,7 +77,7 @@ def predict(command, lens=WIDE):
 def disc():
     """A picture p.png with a green disc where two tiles overlap, and a network; gives its box."""
     picture, box = disc_at((36, -8))
-    write("p.png", picture)
+    save_picture("p.png", picture)
     write_graph(Path("n.onnx"), size=(256, 256))
     return box
 
@@ -103,7 +98,7 @@ def test_a_disc_is_found_at_its_place(view, size, lens, tolerance):
     boxes = []
     for k, place in enumerate(places):
         picture, box = disc_at(place, k % 3, lens)
-        write(f"in/{k}.png", picture)
+        save_picture(f"in/{k}.png", picture)
         boxes.append(box)
     Path("names.txt").write_text("\n".join(NAMES))
     write_graph(Path("n.onnx"), size=size)
@@ -123,7 +118,7 @@ def test_a_disc_is_found_at_its_place(view, size, lens, tolerance):
 
 def test_colours_and_their_normalization_are_the_networks(disc):
     """BGR makes red of blue; and only a picture that is normalised is above 0.5."""
-    write("p.png", disc_at((36, -8), 2)[0])
+    save_picture("p.png", disc_at((36, -8), 2)[0])
     for options, labels in (
         ("", [2]),
         ("--channels rgb", [2]),
@@ -168,7 +163,7 @@ def test_what_is_seen_and_how_its_box_is_drawn(disc):
 def of_constants(options="", view="mercator", **outputs):
     """What a network with these outputs gives for a picture of 64 × 80 pixels."""
     write_constants(Path("n.onnx"), (64, 64), **outputs)
-    write("p.png", np.zeros((64, 80, 3), np.uint8))
+    save_picture("p.png", np.zeros((64, 80, 3), np.uint8))
     (entry,) = predict(f"p.png --network n.onnx --view {view} {options}", SMALL)
     return entry
 
@@ -209,7 +204,7 @@ def test_a_thing_that_is_cut_by_the_end_of_the_lens_is_partly_visible(capsys):
     rows = np.concatenate((rows, [[105, 65, 125, 85, 0.5, 0]]))  # in the first, of its class
     write_constants(Path("n.onnx"), SIZE, found=rows[None].astype(F))
     Path("names.json").write_text(json.dumps([*table]))
-    write("p.png", np.zeros((*SIZE, 3), np.uint8))
+    save_picture("p.png", np.zeros((*SIZE, 3), np.uint8))
     lens = WIDE | {"theta_max": 1.0}  # 88 px around (163, 117)
     (entry,) = predict("p.png --network n.onnx --labels names.json --view stereographic", lens)
     assert (
@@ -302,7 +297,7 @@ def test_what_a_network_needs(disc, monkeypatch):
 )
 def test_what_was_found_before_an_error_is_kept(disc, outputs, options, said):
     """Of a network that computes NaN where there is light, and of a class without a name."""
-    write("in/a.png", np.zeros((*SIZE, 3), np.uint8))
+    save_picture("in/a.png", np.zeros((*SIZE, 3), np.uint8))
     Path("p.png").rename("in/b.png")
     Path("names.txt").write_text("red\n")
     write_graph(Path("n.onnx"), outputs, size=(256, 256))
@@ -368,7 +363,7 @@ def test_masks_and_keypoints_come_back(view, size):
         keypoints=stack(points, 9).reshape(*table.shape[:2], 3, 3),
     )  # fmt: skip
     write_detector(Path("n.onnx"), size, outputs, batch=len(table))
-    write("p.png", np.zeros((*SIZE, 3), np.uint8))
+    save_picture("p.png", np.zeros((*SIZE, 3), np.uint8))
     (entry,) = predict(f"p.png --network n.onnx --view {view}")
     assert [thing["label"] for thing in entry["detections"]] == [0, 1, 2, 3]
     for thing, disc, place, top in zip(entry["detections"], discs, PLACES, tops, strict=True):
@@ -396,7 +391,7 @@ def test_turned_boxes_come_back(view, size):
     names = {0: "a", 1: "b", 2: "c", 3: "d"}
     outputs, said = dict(output0=stack(rows, 7)), dict(task="obb", names=names)
     write_detector(Path("n.onnx"), size, outputs, batch=len(rows), metadata=said)
-    write("000042.png", np.zeros((*SIZE, 3), np.uint8))
+    save_picture("000042.png", np.zeros((*SIZE, 3), np.uint8))
     command = f"000042.png --network n.onnx --view {view} --format"
     (entry,) = predict(f"{command} coco")
     assert [thing["label"] for thing in entry["detections"]] == list("abcd")  # of the file itself
@@ -429,7 +424,7 @@ def test_each_picture_has_an_id_of_its_own_in_coco():
     """Their names are their ids, unless two have one number; and an old file is replaced."""
     write_constants(Path("n.onnx"), (64, 64), found=np.array([[[10, 10, 30, 30, 0.5, 1]]], F))
     for name in ("in/a/7.png", "in/b/8.png", "in/b/c.png", "more/b/07.png"):
-        write(name, np.zeros((64, 80, 3), np.uint8))
+        save_picture(name, np.zeros((64, 80, 3), np.uint8))
     write_frames("in/v.mp4", np.zeros((2, 64, 80, 3), np.uint8), 10)
     frames = ["v.mp4/000000", "v.mp4/000001"]
     names = ["a/7", "b/8", "b/c", *frames]
@@ -462,7 +457,7 @@ def test_boxes_that_overlap_are_merged_and_words_answer_questions(capsys):
     rows[5, np.flatnonzero(near.ravel())] = np.linspace(0.8, 0.9, near.sum())
     rows = np.pad(rows, ((0, 0), (0, 80)))  # the cells of 16 and 32 px
     write_detector(Path("n.onnx"), (128, 128), {"output0": rows[None].astype(F)})
-    write("p.png", np.zeros((64, 80, 3), np.uint8))
+    save_picture("p.png", np.zeros((64, 80, 3), np.uint8))
     with pytest.raises(SystemExit, match=r"may be detect or obb: say which by --form, or"):
         predict("p.png --network n.onnx", SMALL)
     (entry,) = predict("p.png --network n.onnx --form detect", SMALL)
@@ -517,7 +512,7 @@ def test_maps_come_back_to_the_pixels(view):
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     smooth = [128 + 100 * np.sin(x / 40), 128 + 100 * np.cos(y / 30), 60 + 0 * x]
     picture = np.stack(smooth, -1).astype(np.uint8)
-    write("p.png", picture)
+    save_picture("p.png", picture)
     write_graph(Path("n.onnx"), "map and numbers", size=SIZE if view == "none" else (320, 320))
     narrow = "--fov_deg 120" if view == "perspective" else ""
     (entry,) = predict(f"p.png --network n.onnx --view {view} {narrow}")
@@ -634,7 +629,7 @@ def test_names_of_classes_in_every_form(name, text, said):
 
 def test_the_best_classes_of_a_classifier(capsys):
     Path("n.txt").write_text("cat\ndog\n\ncow\n")
-    write("p.png", np.zeros((64, 80, 3), np.uint8))
+    save_picture("p.png", np.zeros((64, 80, 3), np.uint8))
 
     def numbers(values, options=""):
         write_constants(Path("n.onnx"), (64, 64), out=values)

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import save_picture
+from lens_examples import write_opencv
 from PIL import Image
 from videos import write_video
 
@@ -30,11 +32,6 @@ def picture(size=SIZE, channels=3):
     return np.stack([128 + 100 * p for p in planes[:channels]], -1).astype(np.uint8)
 
 
-def save(path, image, **options):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image.squeeze()).save(path, **options)
-
-
 def read(path):
     return np.array(Image.open(path))
 
@@ -42,14 +39,9 @@ def read(path):
 @pytest.fixture
 def folder(tmp_path):
     """A folder with a calibration of OpenCV's fisheye model and a picture."""
-    file = cv2.FileStorage(str(tmp_path / "fisheye.yaml"), cv2.FILE_STORAGE_WRITE)
-    file.write("image_width", SIZE[1])
-    file.write("image_height", SIZE[0])
-    file.write("fisheye_model", 1)
-    file.write("camera_matrix", K)
-    file.write("distortion_coefficients", D)
-    file.release()
-    save(tmp_path / "in" / "a.png", picture())
+    entries = dict(image_width=SIZE[1], image_height=SIZE[0], fisheye_model=1, camera_matrix=K)
+    write_opencv(tmp_path / "fisheye.yaml", **entries, distortion_coefficients=D)
+    save_picture(tmp_path / "in" / "a.png", picture())
     return tmp_path
 
 
@@ -135,11 +127,11 @@ def test_corners_are_shown_unless_the_calibration_ends_before(folder):
 
 def test_pictures_and_videos_of_many_kinds_in_subfolders(folder, capsys, monkeypatch):
     source, planned, plan = folder / "in", [], module._Views._planned
-    save(source / "front" / "grey.png", picture(channels=1))
-    save(source / "front" / "a.png", picture()[::-1])
-    save(source / "large.bmp", cv2.resize(picture(), (256, 192)))
-    save(source / "b.jpg", picture(), quality=95)
-    save(source / "name.ppm", picture())
+    save_picture(source / "front" / "grey.png", picture(channels=1))
+    save_picture(source / "front" / "a.png", picture()[::-1])
+    save_picture(source / "large.bmp", cv2.resize(picture(), (256, 192)))
+    save_picture(source / "b.jpg", picture(), quality=95)
+    save_picture(source / "name.ppm", picture())
     write_video(source / "front" / "drive.mp4", 4, size=SIZE)
     write_video(source / "clip.mkv", 3, size=SIZE)
     monkeypatch.setattr(module._Views, "_planned", lambda *a: planned.append(a[2:]) or plan(*a))
@@ -168,7 +160,7 @@ def test_pictures_and_videos_of_many_kinds_in_subfolders(folder, capsys, monkeyp
 def test_frames_of_videos_are_undistorted_as_pictures(folder):
     frames = write_video(folder / "in" / "drive.mp4", 5, size=(96, 128))
     for k, frame in enumerate(frames):
-        save(folder / "in" / f"{k}.png", frame)
+        save_picture(folder / "in" / f"{k}.png", frame)
     out = run(folder, "--fov=100", "--size=71,91")
     found = list(read_frames(out / "drive.mp4"))
     assert [frame.number for frame in found] == [*range(5)] and math.isclose(found[2].time, 0.2)

@@ -7,14 +7,13 @@ in the released code and in ours. So the comparison runs in a process that selec
 
 import json
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import fixture, refused
+from helpers import fixture, output, refused
 
 from darswin import DarSwin
 from darswin.compat import OfficialDarSwin, OfficialPolynomial, load_official
@@ -53,10 +52,8 @@ def differences(name) -> dict[str, float]:
 def test_equals_the_released_code_to_1e_4(name):
     code = f"import test_official, json; print(json.dumps(test_official.differences({name!r})))"
     path = [str(Path(__file__).parent), *sys.path]
-    environment = dict(os.environ, MKL_CBWR="COMPATIBLE", PYTHONPATH=os.pathsep.join(path))
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
-    assert done.returncode == 0, done.stderr
-    results = json.loads(done.stdout)
+    environment = dict(MKL_CBWR="COMPATIBLE", PYTHONPATH=os.pathsep.join(path))
+    results = json.loads(output(sys.executable, "-c", code, env=environment))
     assert {*results} == {"grid", "embed", *(f"stage{k}" for k in range(4)), "logits"}
     assert max(results.values()) <= 1e-4, results
 

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import product, refused
-from PIL import ExifTags, Image
+from helpers import exif_of, product, refused
+from PIL import Image
 from pngs import PALETTE, png
 from scenes import write, write_plain
 
@@ -39,9 +39,7 @@ def resized(height, width):
 
 
 def turned(file):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.fromarray(PICTURE).save(file, exif=exif)
+    Image.fromarray(PICTURE).save(file, exif=exif_of(6))
 
 
 def with_damaged_exif(file):

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import refused, slow_but
+from helpers import exif_of, refused, slow_but
 from lens_pictures import CALIBRATIONS, WOODSCAPE, at_size, warped, write_frames
-from PIL import ExifTags, Image
+from PIL import Image
 from scenes import write_plain
 from torch.utils.data import BatchSampler, DataLoader, default_collate
 
@@ -270,9 +270,7 @@ def test_unknown_pixels_that_a_worker_reads_are_counted_here(folders):
 def test_exif_turns_picture_and_lens(tmp_path):
     write_frames(tmp_path / "frames", count=3)
     file = next((tmp_path / "frames").rglob("*.png"))
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.open(file).save(file.with_suffix(".jpg"), exif=exif)
+    Image.open(file).save(file.with_suffix(".jpg"), exif=exif_of(6))
     file.unlink()
     dataset = Calibrated(frames(tmp_path), Calibrations(WOODSCAPE), **GREY)
     number = [dataset.source.file(k).suffix for k in range(3)].index(".jpg")

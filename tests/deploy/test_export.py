@@ -3,13 +3,12 @@ results."""
 
 import importlib.util
 import logging
-import subprocess
 import sys
 import zipfile
 
 import pytest
 import torch
-from helpers import create, refused
+from helpers import create, output, refused
 from lens_examples import example
 
 from darswin import create_model
@@ -90,9 +89,7 @@ def test_package_in_a_process_without_the_package(tmp_path):
         with torch.no_grad():
             calls[name] = (images, tensors, model(images, Spherical(**tensors)))
     torch.save(calls, tmp_path / "calls.pt")
-    command = [sys.executable, "-c", ELSEWHERE, _module.FILE]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
+    output(sys.executable, "-c", ELSEWHERE, _module.FILE, cwd=tmp_path)
 
 
 @pytest.fixture

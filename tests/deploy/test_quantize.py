@@ -2,14 +2,12 @@
 models whose fast ones and files compute the same."""
 
 import math
-import os
-import subprocess
 import sys
 
 import pytest
 import torch
 from frame_samples import model_of
-from helpers import refused, relative_error
+from helpers import output, refused, relative_error
 from torch import nn
 
 from darswin import optimize
@@ -264,11 +262,7 @@ with torch.no_grad():
 
 @pytest.mark.slow
 def test_no_integer_products_of_onednn_without_vnni():
-    run = subprocess.run(
-        [sys.executable, "-c", WITHOUT_VNNI], capture_output=True, text=True,
-        env=os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2"},
-    )  # fmt: skip
-    assert run.returncode == 0, run.stderr
+    output(sys.executable, "-c", WITHOUT_VNNI, env={"ONEDNN_MAX_CPU_ISA": "AVX2"})
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["any CPU", "VNNI"])

@@ -1,11 +1,11 @@
 """The site builds without a warning, and has an entry for every public name."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from helpers import output
 from sphinx.util.inventory import InventoryFile
 from test_docstrings import MODULES, public_names
 
@@ -14,9 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.mark.slow
 def test_the_site_has_every_public_name(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-q", "-n", "-W", "--keep-going", DOCS, tmp_path]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    output(sys.executable, "-m", "sphinx", "-q", "-n", "-W", "--keep-going", DOCS, tmp_path)
     with (tmp_path / "objects.inv").open("rb") as file:
         inventory = InventoryFile.load(file, "", lambda base, name: name)
     entries = {name for kind in inventory.values() for name in kind}

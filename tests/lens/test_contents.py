@@ -6,12 +6,11 @@ import io
 import random
 from itertools import product
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from helpers import few_calls, refused
-from lens_examples import FILES, FISHEYE, PLUMB_BOB, f64, file_text, loads
+from lens_examples import FILES, FISHEYE, PLUMB_BOB, f64, file_text, loads, write_opencv
 
 from darswin.lens import load, load_all, to_dict
 
@@ -134,13 +133,9 @@ def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
 def test_a_calibration_with_its_image_points(suffix, tmp_path):
-    path = tmp_path / f"c.{suffix}"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     points = np.random.default_rng(0).uniform(0, 1000, (60, 1000)).astype(np.float32)
-    storage.write("image_points", points)
-    storage.write("camera_matrix", np.reshape(K, (3, 3)))
-    storage.write("distortion_coefficients", np.array([D]))
-    storage.release()
+    matrix, path = np.reshape(K, (3, 3)), tmp_path / f"c.{suffix}"
+    write_opencv(path, image_points=points, camera_matrix=matrix, distortion_coefficients=[D])
     assert path.stat().st_size > 600_000
     with few_calls(3_000_000):
         lens = load(path, image_size=(480, 640), dtype=f64)

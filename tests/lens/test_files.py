@@ -27,6 +27,7 @@ from lens_examples import (
     loads,
     opencv,
     sized,
+    write_opencv,
 )  # fmt: skip
 from scipy.spatial.transform import Rotation
 
@@ -437,10 +438,7 @@ def test_a_file_storage_in_base64_and_a_multi_view_result(end, tmp_path):
             image_sizes=np.array([[1280, 960]] * 3),
         )
         for entries, camera in ((one, None), (rig, "r")):
-            storage = cv2.FileStorage(path, mode)
-            for name, value in entries.items():
-                storage.write(name, value)
-            storage.release()
+            write_opencv(path, mode, **entries)
             lens = load(path, camera=camera, dtype=f64, image_size=(960, 1280))
             described = to_dict(lens)
             assert described | EQUI == described

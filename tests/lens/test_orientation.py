@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from helpers import refused
+from helpers import exif_of, refused
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 
@@ -61,9 +61,7 @@ def test_a_ray_lands_where_its_pixel_went(lens, orientation, theta, azimuth):
 def test_a_lens_is_shown_in_the_picture_that_exif_turns(tmp_path, monkeypatch, orientation):
     lens = Equidistant(20.0, theta_max=1.3, center=(40.0, 20.0), image_size=(48, 64))
     save(lens, tmp_path / "lens.json")
-    image, exif = Image.new("RGB", (64, 48)), Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    image.save(tmp_path / "p.jpg", exif=exif)
+    Image.new("RGB", (64, 48)).save(tmp_path / "p.jpg", exif=exif_of(orientation))
     drawn = []
     monkeypatch.setattr(plot, "draw_lens", lambda picture, lens, *_: drawn.append((picture, lens)))
     monkeypatch.setattr(plot, "save_figure", lambda *_: None)

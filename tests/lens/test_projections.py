@@ -24,6 +24,7 @@ from lens_examples import (
     loads,
     message,
     points_around,
+    write_opencv,
 )  # fmt: skip
 
 from darswin.lens import EnhancedUnified, load, load_all, to_dict
@@ -34,15 +35,6 @@ def test_radii_of_calibrations_to_a_thousandth_of_a_pixel(name, camera):
     lens = load(FILES / name, camera=camera, dtype=f64)
     expected = double(*CALIBRATIONS[name, camera])
     torch.testing.assert_close(lens.project(DEGREES.deg2rad()), expected, rtol=0, atol=1e-3)
-
-
-def write(path, **entries):
-    """A file written by OpenCV's FileStorage, in the notation of its suffix."""
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in entries.items():
-        storage.write(name, np.asarray(value, float) if isinstance(value, list) else value)
-    storage.release()
-    return path
 
 
 def fisheye(points, d, alpha):
@@ -59,7 +51,7 @@ def pinhole(points, d, k=K):
 def test_opencv_fisheye(tmp_path, suffix, alpha):
     k = np.array(K)
     k[0, 1] = alpha * k[0, 0]
-    path = write(tmp_path / f"c.{suffix}", K=k.tolist(), D=FISHEYE, image_width=1280,
+    path = write_opencv(tmp_path / f"c.{suffix}", K=k.tolist(), D=FISHEYE, image_width=1280,
                  image_height=960, fisheye_model=1)  # fmt: skip
     points = points_around(1.4)
     assert_projects(load(path, dtype=f64), points, fisheye(points, FISHEYE, alpha))
@@ -72,7 +64,7 @@ def test_opencv_fisheye(tmp_path, suffix, alpha):
     ("json", [0.0] * 5),
 ], ids=["radtan", "plumb_bob", "rational", "thin_prism", "untilted", "none"])  # fmt: skip
 def test_opencv_pinhole(tmp_path, suffix, d):
-    path = write(tmp_path / f"c.{suffix}", camera_matrix=K, distortion_coefficients=d,
+    path = write_opencv(tmp_path / f"c.{suffix}", camera_matrix=K, distortion_coefficients=d,
                  image_width=1280, image_height=960)  # fmt: skip
     lens = load(path, coefficients="pinhole", dtype=f64)
     assert_projects(lens, points_around(0.7), pinhole(points_around(0.7), d))

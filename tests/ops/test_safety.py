@@ -1,64 +1,55 @@
 """Small tests for past bugs: out-of-bounds reads and writes, crashes and hangs."""
 
-import subprocess
 import sys
-import textwrap
 
 import pytest
 import torch
-
-
-def run(code: str) -> subprocess.CompletedProcess:
-    """Runs code in a separate process, which may crash."""
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120
-    )
-
+from helpers import output
 
 # -- memory ----------------------------------------------------------------------------------------
 
 
 LACKING_MEMORY = """
-    import resource, torch
-    from darswin.utils.malloc import give_back_memory
-    from darswin.ops import polar_sample
-    torch.set_num_threads(2)
-    image = torch.rand(2, 1, 9, 9)
-    radii, azimuths = torch.linspace(0, 4, 1000)[None], torch.linspace(0, 6, 4000)
-    center = torch.full((1, 2), 4.0)
+import resource, torch
+from darswin.utils.malloc import give_back_memory
+from darswin.ops import polar_sample
+torch.set_num_threads(2)
+image = torch.rand(2, 1, 9, 9)
+radii, azimuths = torch.linspace(0, 4, 1000)[None], torch.linspace(0, 6, 4000)
+center = torch.full((1, 2), 4.0)
 
-    def large():  # 16 MB, and 64 MB of working memory for each thread
-        return polar_sample(image.bfloat16(), radii, azimuths, center, samples=(1000, 1))
+def large():  # 16 MB, and 64 MB of working memory for each thread
+    return polar_sample(image.bfloat16(), radii, azimuths, center, samples=(1000, 1))
 
-    def small():
-        return polar_sample(image, radii[:, ::100], azimuths[:40], center, samples=(2, 2))
+def small():
+    return polar_sample(image, radii[:, ::100], azimuths[:40], center, samples=(2, 2))
 
-    def size(name):
-        give_back_memory()  # what glibc keeps of freed memory
-        (line,) = [l for l in open("/proc/self/status") if l.startswith(name)]
-        return int(line.split()[1]) * 1024
+def size(name):
+    give_back_memory()  # what glibc keeps of freed memory
+    (line,) = [l for l in open("/proc/self/status") if l.startswith(name)]
+    return int(line.split()[1]) * 1024
 
-    first = small().clone()
-    resource.setrlimit(resource.RLIMIT_AS, (size("VmSize") + 60 * 2**20, resource.RLIM_INFINITY))
-    for _ in range(3):
-        try:
-            large()
-        except (MemoryError, RuntimeError) as error:
-            print(type(error).__name__)
-        assert torch.equal(small(), first)
-    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)
-    image = torch.ones(1, 1, 6000, 6000, dtype=torch.bfloat16)
-    before = size("VmSize")
-    polar_sample(image, radii[:, ::100], azimuths[:40], center[:1], samples=(2, 2))
-    print((size("VmSize") - before) // 2**20)
-    before = size("VmRSS")
-    assert large().isfinite().all()
-    frames = torch.ones(2, 1, 4000, 4000, dtype=torch.bfloat16, requires_grad=True)
-    out = polar_sample(frames, radii, azimuths[:40], center, samples=(1, 1))
-    (grad,) = torch.autograd.grad(out.float().sum(), frames)  # whose sums take 256 MB
-    assert grad.count_nonzero() > 0
-    del out, grad, frames
-    print((size("VmRSS") - before) // 2**20)
+first = small().clone()
+resource.setrlimit(resource.RLIMIT_AS, (size("VmSize") + 60 * 2**20, resource.RLIM_INFINITY))
+for _ in range(3):
+    try:
+        large()
+    except (MemoryError, RuntimeError) as error:
+        print(type(error).__name__)
+    assert torch.equal(small(), first)
+resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)
+image = torch.ones(1, 1, 6000, 6000, dtype=torch.bfloat16)
+before = size("VmSize")
+polar_sample(image, radii[:, ::100], azimuths[:40], center[:1], samples=(2, 2))
+print((size("VmSize") - before) // 2**20)
+before = size("VmRSS")
+assert large().isfinite().all()
+frames = torch.ones(2, 1, 4000, 4000, dtype=torch.bfloat16, requires_grad=True)
+out = polar_sample(frames, radii, azimuths[:40], center, samples=(1, 1))
+(grad,) = torch.autograd.grad(out.float().sum(), frames)  # whose sums take 256 MB
+assert grad.count_nonzero() > 0
+del out, grad, frames
+print((size("VmRSS") - before) // 2**20)
 """
 
 
@@ -66,9 +57,8 @@ LACKING_MEMORY = """
 @pytest.mark.unsanitized
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory and reads /proc")
 def test_out_of_memory_is_an_error_and_large_working_memory_is_given_back():
-    done = run(LACKING_MEMORY)
-    assert done.returncode == 0, done.stderr
-    *errors, sampled, kept = done.stdout.split()
+    # A process of its own, which may crash.
+    *errors, sampled, kept = output(sys.executable, "-c", LACKING_MEMORY, timeout=120).split()
     assert len(errors) == 3 and set(errors) <= {"MemoryError", "RuntimeError"}
     assert int(sampled) < 300  # MB of addresses; the sums of a gradient would take 576 MB
     assert int(kept) < 80  # MB for two threads, which once kept 512 MB

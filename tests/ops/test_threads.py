@@ -3,7 +3,6 @@
 import random
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import output
 from torch import Tensor
 
 from darswin.ops import polar_sample, polar_to_image, window_attention
@@ -149,10 +149,7 @@ unsanitized = pytest.mark.unsanitized
     ],
 )
 def test_a_process_ends_well(code):
-    done = subprocess.run(
-        [sys.executable, "-c", SAMPLE + code], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+    output(sys.executable, "-c", SAMPLE + code, timeout=300)
 
 
 @pytest.mark.slow
@@ -162,8 +159,7 @@ def test_thread_sanitizer_finds_no_race_in_the_pool(tmp_path):
     program = tmp_path / "pool"
     sources = [ROOT / "tests" / "cpp" / "pool.cpp", ROOT / "csrc" / "core" / "parallel.cpp"]
     flags = ["-std=c++20", "-g", "-O1", "-fsanitize=thread", "-pthread", f"-I{ROOT / 'csrc'}"]
-    subprocess.run(["g++", *flags, *sources, "-o", program], check=True)
-    done = subprocess.run([program], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    helped = re.search(r"10000 calls, in which helpers ran (\d+) ranges", done.stdout)
+    output("g++", *flags, *sources, "-o", program)
+    said = output(program, timeout=300)
+    helped = re.search(r"10000 calls, in which helpers ran (\d+) ranges", said)
     assert helped is not None and int(helped[1]) > 0

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import output
 from runs import DIGITS, PIXELS, assert_same, checkpoint, fit, test
 from train.kills import finish, start, wait_for_steps
 
@@ -157,11 +158,8 @@ def test_two_processes_train_and_test_as_one(scenes, tmp_path, task):
     script = tmp_path / "both.py"
     script.write_text(BOTH)
     # Lightning starts the second process as a copy of the first.
-    done = subprocess.run(
-        [sys.executable, str(script), json.dumps(commands)],
-        capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
+    threads = {"OMP_NUM_THREADS": "1"}
+    output(sys.executable, script, json.dumps(commands), env=threads, timeout=300)
     found, expected = (with_gradients(checkpoint(run)["state_dict"]) for run in (two, one))
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
     for a, b in zip(json.loads((one / "test.json").read_text())["results"], before, strict=True):

@@ -1,6 +1,5 @@
 """Whole runs in this process: tasks × data × what happens to them."""
 
-import csv
 import json
 import os
 import re
@@ -27,6 +26,7 @@ from runs import (
     fit,
     killed_fit,
     patch_batch,
+    table,
     test,
 )
 from scenes import CLASSES, write_plain
@@ -44,11 +44,6 @@ from darswin.train.tasks import TASKS
 from darswin.utils.files import locked
 
 EQUIDISTANT = {"model": "Equidistant", "focal": 45.0, "theta_max": 1.5, "image_size": [121, 160]}
-
-
-def table(file):
-    with file.open() as lines:
-        return list(csv.DictReader(lines))
 
 
 @pytest.fixture

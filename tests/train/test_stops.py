@@ -1,13 +1,12 @@
 """Runs that stop without an error: a resumed one ends where an uninterrupted one does."""
 
-import csv
 import os
 import signal
 from contextlib import nullcontext
 
 import pytest
 from helpers import in_turn, slow_but
-from runs import DIGITS, assert_same, checkpoint, fit, patch_batch
+from runs import DIGITS, assert_same, checkpoint, fit, patch_batch, table
 
 from darswin.train.classification import Classification
 
@@ -30,8 +29,7 @@ def validations(run):
     """What a run and its continuations logged of their validations."""
     found = []
     for file in sorted(run.glob("csv/*/metrics.csv"), key=lambda file: file.stat().st_mtime_ns):
-        with file.open() as lines:
-            rows = [line for line in csv.DictReader(lines) if line.get("val/loss")]
+        rows = [line for line in table(file) if line.get("val/loss")]
         found += [(row["epoch"], row["step"], row["val/loss"], row["val/top1"]) for row in rows]
     return found
 

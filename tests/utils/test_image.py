@@ -4,7 +4,8 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from PIL import ExifTags, Image, ImageOps
+from helpers import exif_of
+from PIL import Image, ImageOps
 from pngs import chunk
 
 from darswin.utils.image import (
@@ -43,10 +44,8 @@ def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
     """Training and predicting read the same pixels, which Pillow turns the same way."""
     pixels = np.kron(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40, np.ones((16, 16), np.uint8))
     for orientation in range(1, 9):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = orientation
         path = tmp_path / f"{orientation}.{suffix}"
-        Image.fromarray(pixels).convert("RGB").save(path, exif=exif, quality=100)
+        Image.fromarray(pixels).convert("RGB").save(path, exif=exif_of(orientation), quality=100)
         with Image.open(path) as file:
             upright = np.asarray(ImageOps.exif_transpose(file).convert("L"))
         image, found = read_oriented(path, channels)
@@ -86,9 +85,7 @@ def test_grey_and_colour_files(tmp_path):
 def test_a_png_that_says_no_orientation_is_decoded_once(tmp_path, monkeypatch):
     """Pillow decodes a PNG whole to look for EXIF behind its pixels."""
     Image.new("RGB", (8, 6)).save(tmp_path / "plain.png")
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 8
-    Image.new("RGB", (8, 6)).save(tmp_path / "turned.png", exif=exif)
+    Image.new("RGB", (8, 6)).save(tmp_path / "turned.png", exif=exif_of(8))
     # EXIF behind the pixels, where the format allows it too.
     data = (tmp_path / "turned.png").read_bytes()
     start = data.index(b"eXIf") - 4

@@ -1,8 +1,8 @@
 import platform
-import subprocess
 import sys
 
 import pytest
+from helpers import output
 
 from darswin.utils import malloc
 
@@ -29,8 +29,7 @@ print(min(faults() for _ in range(8)))
 
 def faults(call: str, what: str) -> int:
     # A process of its own: what is told to malloc stays.
-    command = [sys.executable, "-c", SCRIPT.format(call=call, what=what)]
-    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return int(output(sys.executable, "-c", SCRIPT.format(call=call, what=what)))
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers import refused
-from PIL import ExifTags, Image
+from helpers import exif_of, refused, save_picture
+from PIL import Image
 from scenes import write_woodscape
 
 from darswin.boxes import Instances, encode_rle
@@ -54,8 +54,7 @@ IMAGES = [
 
 def write_pictures(folder, *names):
     for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / name), np.zeros((*SIZE, 3), np.uint8))
+        save_picture(folder / name, np.zeros((*SIZE, 3), np.uint8))
 
 
 def write(folder, place="images", path="instances.json", **changes):
@@ -211,9 +210,8 @@ def test_wrong_coco_files(tmp_path, changes, said):
 
 
 def test_sides_before_exif_turns_a_picture_are_told(tmp_path):
-    file, exif = write(tmp_path), Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.new("L", (80, 60)).save(tmp_path / "images" / "a.png", exif=exif)
+    file = write(tmp_path)
+    Image.new("L", (80, 60)).save(tmp_path / "images" / "a.png", exif=exif_of(6))
     refused("80 × 60 px .* when its EXIF orientation turns it", read_coco(file).labels, 0)
 
 

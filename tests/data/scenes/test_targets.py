@@ -8,10 +8,10 @@ import warnings
 import cv2
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import exif_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import ExifTags, Image
+from PIL import Image
 from pngs import COLOUR, COLOUR_ALPHA, GREY, GREY_ALPHA, PALETTE, png
 from scenes import SIZE, write, write_plain
 
@@ -101,9 +101,8 @@ def test_what_was_written_is_read(tmp_path):
 def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
     write_plain(tmp_path, 3)
     scenes = open_scenes(tmp_path, "all", "labels")
-    picture, exif = tmp_path / "images" / "001.png", Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.open(picture).save(picture, exif=exif)
+    picture = tmp_path / "images" / "001.png"
+    Image.open(picture).save(picture, exif=exif_of(6))
     refused(r"001\.png has the EXIF orientation 6", scenes.__getitem__, 1)
     lens = json.loads((tmp_path / "lens.json").read_text())
     (tmp_path / "lens.json").write_text(json.dumps(lens | {"image_size": [50, 50]}))
