@@ -13,6 +13,7 @@ from darswin.views.crop import CropView
 from darswin.views.cylindrical import CylindricalView
 from darswin.views.directions import RayView
 from darswin.views.equirectangular import EquirectangularView
+from darswin.views.ground import GroundView
 from darswin.views.mercator import MercatorView
 from darswin.views.orientation import turned, up_of
 from darswin.views.panorama import PanoramaView
@@ -22,6 +23,7 @@ from darswin.views.plain import PlainView
 from darswin.views.polar import PolarView
 from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.remap import Remap
+from darswin.views.rig import RigRemap
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
 from darswin.views.tiles import TilesView
@@ -32,6 +34,7 @@ __all__ = [
     "CropView",
     "CylindricalView",
     "EquirectangularView",
+    "GroundView",
     "MercatorView",
     "PanoramaView",
     "PerspectiveView",
@@ -42,6 +45,7 @@ __all__ = [
     "PolarView",
     "RayView",
     "Remap",
+    "RigRemap",
     "SquareView",
     "StereographicView",
     "TilesView",

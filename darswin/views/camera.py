@@ -1,7 +1,7 @@
 """What another camera at the same place would see: another lens, and a turn about its axis."""
 
 import math
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -79,6 +79,9 @@ class CameraView(PixelView):
         theta, direction = pixel_rays(self._like(lens), self.size)
         theta = torch.where(lens.sees(theta), theta, torch.nan)
         return theta, direction @ self._matrix(theta)
+
+    def in_rig(self) -> Self:
+        return self._with(lens=self.lens.detach().to("cpu", torch.float64))
 
     def camera(self, lens: Lens, size: Pair) -> Lens:
         return self.lens

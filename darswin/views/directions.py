@@ -100,6 +100,15 @@ class RayView(PixelView):
         # What the view covers takes most of the time of `to_view`.
         return self._with(_fixed=self._layout(check_lens(lens, size), size))
 
+    def in_rig(self) -> Self:
+        # Of a rig, a view without `fov` shows as much as its kind of map usually has.
+        if getattr(self, "reach", None) is not None:
+            raise ValueError("`reach` follows one lens: give a view of a rig its `fov`")
+        fov = self.fov or self.usual_fov
+        start = self._start(torch.zeros((), dtype=torch.float64))
+        step = start.new_tensor([[2 * self.half_width(fov / 2) / self.size[1]]])
+        return self._with(fov=fov, _fixed=(step, start))
+
     def to_plane(self, rays: Tensor) -> Tensor:
         """Unit vectors (..., 3) in the view's frame → the plane, (..., 2); NaN where it ends."""
         raise NotImplementedError

@@ -2,7 +2,8 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, Self, cast, overload
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from darswin.lens import ImplausibleLens, Lens
 from darswin.lens.files.load import reach
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, ray_channels, sample_at
 from darswin.lens.plausible import doubts
+from darswin.lens.rig import Camera, Rig
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, check_pair, tensor_there
 from darswin.views.base import (
@@ -27,6 +29,8 @@ from darswin.views.base import (
 )
 from darswin.views.orientation import AXIS
 from darswin.views.remap import Remap
+from darswin.views.rig import RigRemap
+from darswin.views.rig_reads import Seam, local
 from darswin.views.turn import STILL
 
 _MOST = 16  # points along each side of a pixel
@@ -43,10 +47,12 @@ class PixelView(View):
     Attributes:
         turn: of the view relative to the picture.
         tiles: the views of which this one consists, if there are several.
+        is_surface: whether the view shows places, such as those of the ground, or directions.
     """
 
     turn = STILL
     tiles: Sequence["PixelView"] = ()
+    is_surface = False
 
     def __init__(
         self, size: Pair | None, *, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0
@@ -56,13 +62,26 @@ class PixelView(View):
             size = check_pair("size", size, 1)
         self.size = size
 
-    def at(self, lens: Lens | None, size: Pair) -> Remap:
-        """The map between this view and pictures of (H, W) of one lens. See `Remap`.
+    @overload
+    def at(self, lens: Lens | None, size: Pair) -> Remap: ...
+
+    @overload
+    def at(
+        self, lens: Rig, *, seam: Seam = "hard", gain: bool = False, distance: float | None = None
+    ) -> RigRemap: ...
+
+    def at(self, lens: Any, size: Any = None, **options: Any) -> Any:
+        """The map between this view and pictures of (H, W) of one lens, see `Remap`; or those of
+        all cameras of a `Rig`, see `RigRemap`, which takes `seam`, `gain` and `distance`.
 
         Warns:
             ImplausibleLens: a lens without an image_size does not fit pictures of this size.
         """
-        remap = Remap(self, lens, size)
+        if isinstance(lens, Rig):
+            if size is not None:
+                raise ValueError(f"a rig knows the sizes of its pictures: leave out {size}")
+            return RigRemap(self, lens, **options)
+        remap = Remap(self, lens, size, **options)
         if lens is not None and lens.image_size is None:  # others are judged as they are read
             sized = lens.detach().replace(image_size=lens.theta_max.new_tensor([remap.size]))
             (doubt,) = doubts(sized.with_theta_max(reach(sized)))
@@ -116,6 +135,32 @@ class PixelView(View):
         supersampling, (height, width) = self.supersampling_of(lens, size), self.size
         grid = pixel_grid((height * supersampling, width * supersampling), lens.theta_max)
         return grid if supersampling == 1 else (grid + 0.5) / supersampling - 0.5
+
+    # -- in the level frame of a rig, what `RigRemap` asks for ---------------------------------
+
+    def in_rig(self) -> Self:
+        """The same view of a rig; TypeError if the view follows one lens."""
+        raise TypeError(
+            f"{type(self).__name__} follows one lens, but a rig has several: show it by "
+            "GroundView, CameraView or a view of rays, such as equirectangular"
+        )
+
+    def of_camera(self, camera: Camera, rig: Rig, distance: float | None) -> "PixelView":
+        """What one camera of a rig shows of this view."""
+        return _OfCamera(self, camera, rig, distance)
+
+    def places(self, points: Tensor) -> Tensor:
+        """Where pixels (1, ..., 2) of the view look, (1, ..., 3): x right, y down and z ahead of a
+        rig. Directions, or places in metres if the view `is_surface`; NaN where it shows nothing.
+        """
+        assert self.size is not None
+        return self.to_rays(points, cast(Lens, getattr(self, "lens", None)), self.size)
+
+    def met_by(self, rays: Tensor, origin: Tensor) -> Tensor:
+        """The pixels at which rays (1, ..., 3) from a place (3,) meet what the view shows; NaN for
+        rays that do not meet it. The inverse of `places`."""
+        assert self.size is not None
+        return self.to_points(rays, cast(Lens, getattr(self, "lens", None)), self.size)
 
     # -- of one lens: what `Remap` asks for -----------------------------------------------------
 
@@ -227,6 +272,33 @@ class PixelView(View):
 
     def extra_repr(self) -> str:
         return f"size={self.size}"
+
+
+class _OfCamera(PixelView):
+    """What one camera of a rig shows of a view. `distance` is that of `RigRemap`."""
+
+    def __init__(self, view: PixelView, camera: Camera, rig: Rig, distance: float | None):
+        super().__init__(view.size, mean=view.mean, std=view.std)
+        self.view, self.distance = view, distance
+        self._local = partial(local, camera, rig)
+        self._turn = torch.from_numpy(rig.level.T @ camera.pose[:3, :3])  # to the level frame
+        self._origin = torch.from_numpy(camera.pose[:3, 3] @ rig.level)
+        self._middle = torch.from_numpy(rig.middle @ rig.level)
+
+    def to_rays(self, points: Tensor, lens: Any, size: Pair) -> Tensor:
+        at = self.view.places(points)
+        if self.distance is not None:
+            at = self.distance * at + self._middle
+        are_places = self.view.is_surface or self.distance is not None
+        return F.normalize(torch.from_numpy(self._local(at.numpy(), are_places)), dim=-1)
+
+    def to_points(self, rays: Tensor, lens: Any, size: Pair) -> Tensor:
+        rays = rays @ self._turn.T
+        if self.distance is not None:  # where it meets the sphere around the middle
+            out = self._origin - self._middle
+            along = (rays * out).sum(-1, keepdim=True)
+            rays = out + rays * ((along**2 - out @ out + self.distance**2).sqrt() - along)
+        return self.view.met_by(rays, self._origin)
 
 
 def _moved(rays: Tensor, move: Callable[[Tensor], Tensor]) -> Tensor:

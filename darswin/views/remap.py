@@ -332,7 +332,7 @@ class Remap:
     @_kept
     def _target_points(self) -> np.ndarray:
         points = self._bound.points_of_target(self.lens, self.size)
-        return points + _aside(self.view_size) @ self.view.turn.matrix
+        return points + aside(self.view_size) @ self.view.turn.matrix
 
     def back(self, maps: Points) -> Points:
         """A map of a network for the view → the pixels of the picture; 0 unless `shown`.
@@ -385,7 +385,7 @@ class Remaps(Sequence[Remap]):
         return self._made[number]
 
 
-def _aside(size: Pair) -> np.ndarray:
+def aside(size: Pair) -> np.ndarray:
     """The offset of each pixel, before the nearest label is chosen, (H', W', 2) px.
 
     An even reduction puts every centre halfway between two pixels. If all took the upper one, the

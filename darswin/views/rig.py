@@ -1,0 +1,402 @@
+"""A view bound to a rig: the map between the pictures of several cameras and the view."""
+
+import itertools
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from darswin.lens.rig import Rig
+from darswin.ops import _module
+from darswin.ops.checks import per_channel
+from darswin.utils.arrays import as_tensor
+from darswin.utils.parameters import check
+from darswin.utils.tasks import IGNORE
+from darswin.views.base import Pair, PerChannel, View
+from darswin.views.remap import Remap, aside
+from darswin.views.rig_reads import Reads, Seam, Seen, corners, grid, read_at, reads_of, see
+
+if TYPE_CHECKING:
+    from darswin.frames.plans import Sampler
+    from darswin.frames.rig_plans import RigPlan
+
+Frames = Sequence[Any] | Mapping[str, Any]
+
+_ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
+_ONE_PLACE = 1e-6  # m
+_GREY = (4, 251)  # of 8 bits: what is darker or lighter says nothing about gains
+
+
+class RigRemap:
+    """The map between the pictures of a rig's cameras and what a view shows of them together.
+
+    `view.at(rig)` makes it. Each point of a pixel is read from the camera whose axis is nearest, as
+    a share of θ_max, or from the two nearest, and a pixel is the mean of its points. Their number
+    follows the ratio of the scales. Points of a picture's outer half pixel count as on its border.
+
+    Frames are a list in the order of `rig.names`, or a mapping from names, which then decide.
+
+    Args:
+        view: a `GroundView`, a `CameraView`, or a view of rays, in the rig's level frame: x right,
+            y down, z ahead. Without `fov`, a view of rays shows as much as its kind usually has.
+        seam: "hard" reads each point from one camera; "narrow" mixes two in the middle of their
+            overlap, and "wide" in all of it.
+        gain: whether each camera gets one factor, from where the frames overlap; see `gains`.
+        distance: m, of what the view shows from the middle of the rig. None is infinity: right if
+            the cameras are at one place. A `GroundView` has its own.
+
+    Attributes:
+        view_size: (H', W') of the view. sources: for each camera its own `Remap`, with which points
+            and boxes move.
+
+    Raises:
+        TypeError: the view follows one lens.
+        ValueError: an argument is out of range, no camera sees anything of the view, or a camera is
+            not above the ground of a `GroundView`.
+    """
+
+    def __init__(
+        self, view: Any, rig: Rig, *, seam: Seam = "hard", gain: bool = False,
+        distance: float | None = None,
+    ):  # fmt: skip
+        check("seam", repr(seam), seam in get_args(Seam), f"one of {', '.join(get_args(Seam))}")
+        if distance is not None:
+            is_right = not view.is_surface and rig.spread < distance < math.inf
+            check("distance", distance, is_right, "above the distances of the cameras from their "
+                  "middle, and left out for a GroundView")  # fmt: skip
+        self.view, self.rig = view.in_rig(), rig
+        self.seam, self.gain, self.distance = seam, gain, distance
+        self.view_size: Pair = self.view.size
+        self.sources: dict[str, Remap] = {}
+        for name, camera in rig.cameras.items():
+            height = camera.pose[:3, 3] @ rig.up
+            if view.is_surface and height <= 0:
+                raise ValueError(
+                    f"camera {name} is {height:.3g} m above the ground, which passes through the "
+                    "rig's origin: rig.raised(height) lowers the origin to the ground"
+                )
+            seen = self.view.of_camera(camera, rig, distance)
+            self.sources[name] = Remap(seen, camera.lens, camera.size)
+
+    # -- points -------------------------------------------------------------------------------
+
+    def to_image(self, points: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (..., 2) of the view → the number of the camera that shows each best, (...), -1
+        for none; and its pixels there, (..., 2), NaN for none."""
+        flat = np.asarray(points, np.float64).reshape(-1, 2)
+        seen, shape = see(self.view, self.rig, self.distance, flat), np.shape(points)
+        best = np.where(seen.room.max(0) >= 0, seen.room.argmax(0), -1)
+        pixels = np.where(best[:, None] >= 0, seen.pixels[best, np.arange(len(flat))], np.nan)
+        return best.reshape(shape[:-1]), pixels.reshape(shape)
+
+    def to_view(self, points: Any, source: int | str = 0) -> Any:
+        """Pixels (..., 2) of a camera's picture, by its number or name → pixels of the view, also
+        beyond its edges; NaN where it does not show them."""
+        return self.source(source).to_view(points)
+
+    def source(self, source: int | str) -> Remap:
+        """The map of one camera, by its number or its name."""
+        name = source if isinstance(source, str) else self.rig.names[source]
+        self.rig[name]  # KeyError for an unknown one
+        return self.sources[name]
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """The pixels of the view that show something of a picture, (H', W')."""
+        return np.bincount(self.reads.pixels, minlength=self._count).reshape(self.view_size) > 0
+
+    # -- frames -------------------------------------------------------------------------------
+
+    def __call__(self, frames: Frames) -> Any:
+        """What the view shows of frames; 0 where it shows nothing.
+
+        Args:
+            frames: arrays (H, W) or (H, W, C), of up to 16 bits or in floating point, all of one
+                type; or tensors (B, C, H, W), through which gradients flow.
+
+        Returns:
+            (H', W') or (H', W', C), of the frames' dtype; of tensors (B, C, H', W').
+
+        Raises:
+            TypeError, ValueError: frames are missing, unknown, of other sizes or of unequal types.
+        """
+        frames = self._listed(frames)
+        gains = self.gains(frames) if self.gain else None
+        if isinstance(frames[0], Tensor):
+            return self._mixed([View.floating(self.view, f, torch.float32) for f in frames], gains)
+        is_plain = frames[0].dtype == np.uint8 and frames[0].shape[2:] in ((), (1,), (3,))
+        if is_plain and _module.LACK is None:
+            return self.sampler(gains=gains)(frames)
+        kind = frames[0].dtype
+        planes = [as_tensor(np.atleast_3d(f)).movedim(2, 0)[None] for f in frames]
+        planes = [p if p.is_floating_point() else p.float() for p in planes]
+        picture = self._mixed(planes, gains)[0].movedim(0, -1).numpy()
+        if kind.kind != "f":
+            picture = picture.round().clip(0, np.iinfo(kind).max)
+        return picture.astype(kind).reshape(*self.view_size, *frames[0].shape[2:])
+
+    def target(self, targets: Frames) -> np.ndarray:
+        """Maps of labels in the view: each pixel takes the nearest of its best camera, never a
+        mixture.
+
+        Args:
+            targets: arrays (H, W), as `frames`.
+
+        Returns:
+            (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where the
+            view shows nothing.
+        """
+        targets, picture = self._listed(targets, dims=2), None
+        for number, target in enumerate(targets):
+            kind = target.dtype.newbyteorder("=")
+            if picture is None:
+                missing = IGNORE if kind == np.uint8 else 0
+                picture = np.full(self._count, missing, kind)
+            mine, (x, y) = self._nearest(number)
+            picture[mine] = target.astype(kind, copy=False)[y, x]
+        assert picture is not None
+        return picture.reshape(self.view_size)
+
+    def depth(
+        self, depths: Frames, to: Literal["distance", "z"] = "distance",
+        of: Literal["distance", "z"] = "z",
+    ) -> np.ndarray:  # fmt: skip
+        """The distances of what the view shows, without surfaces that stand nowhere.
+
+        1/z of a picture without distortion is linear on a plane: it is interpolated where four
+        neighbours are within 10 % of each other; else the nearest counts.
+
+        Args:
+            depths: arrays (H, W) in floating point, in any unit; infinite for the sky; unknown if
+                NaN or not above 0.
+            to: what is wanted: distances along rays, or z along the axis of the view.
+            of: what the arrays hold: z along the axis of each camera, or distances along rays.
+
+        Returns:
+            (H', W') float32, NaN where nothing is known.
+
+        Raises:
+            ValueError: the cameras are at different places, so that their distances are not those
+                of the view.
+        """
+        for name, kind in (("to", to), ("of", of)):
+            check(name, repr(kind), kind in ("distance", "z"), "distance or z")
+        if self.view.is_surface or self.rig.spread > _ONE_PLACE:
+            raise ValueError("distances are those of a view if all cameras are at its place")
+        depths = self._listed(depths, dims=2)
+        distances = np.full(self._count, np.nan)
+        for number, (depth, remap) in enumerate(zip(depths, self.sources.values(), strict=True)):
+            mine, (x, y) = self._nearest(number)
+            points = self._seen.pixels[number, mine]
+            values = 1 / np.where(depth > 0, depth, np.nan).astype(np.float64)
+            columns, rows, right, lower = corners(points, remap.size)
+            four = np.stack([values[rows + k // 2, columns + k % 2] for k in range(4)])
+            with np.errstate(invalid="ignore"):
+                one_surface = four.max(0) <= _ONE_SURFACE * four.min(0)
+            across = four[::2] * (1 - right) + four[1::2] * right
+            mixed = across[0] * (1 - lower) + across[1] * lower
+            cosine = remap.rays_of_image(points)[:, 2] if of == "z" else 1.0
+            with np.errstate(divide="ignore"):
+                distances[mine] = 1 / (np.where(one_surface, mixed, values[y, x]) * cosine)
+        if to == "z":
+            axis = getattr(self.view, "direction", (0.0, 0.0, 1.0))
+            rays = self.view.places(torch.from_numpy(self._grid)[None])[0].numpy()
+            distances *= rays @ np.array(axis)
+        return distances.reshape(self.view_size).astype(np.float32)
+
+    # -- where cameras overlap ----------------------------------------------------------------
+
+    def overlaps(self, frames: Frames) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]:
+        """What two cameras show where both see the view, for each pair that overlaps.
+
+        Returns:
+            By the names of a pair: the pixels of the view, (K, 2) x and y; and their values, (2, K,
+            C) float32, from the frames of both.
+        """
+        values = []
+        for frame, pixels in zip(self._listed(frames), self._seen.pixels, strict=True):
+            planes = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None].float()
+            values.append(read_at(planes, np.nan_to_num(pixels))[0].T.numpy())
+        shown = self._seen.room >= 0
+        pairs = {}
+        for a, b in itertools.combinations(range(len(values)), 2):
+            both = np.flatnonzero(shown[a] & shown[b])
+            if len(both):
+                names, width = self.rig.names, self.view_size[1]
+                places = np.stack((both % width, both // width), -1)
+                pairs[names[a], names[b]] = places, np.stack((values[a][both], values[b][both]))
+        return pairs
+
+    def gains(self, frames: Frames) -> np.ndarray:
+        """The factors (n,) of the cameras that make their frames equally bright where they overlap.
+
+        The product of all factors is 1. Of frames of 8 bits, values near 0 and 255 do not count. A
+        camera that overlaps with no other has the factor 1.
+        """
+        names = self.rig.names
+        rows, goals = [np.ones(len(names))], [0.0]
+        for (a, b), (_, (first, second)) in self.overlaps(frames).items():
+            inside = np.ones(first.shape[:1], bool)
+            if self._listed(frames)[0].dtype == np.uint8:
+                both = np.concatenate((first, second), 1)
+                inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
+            sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
+            if min(sums) > 0:
+                row, weight = np.zeros(len(names)), math.sqrt(inside.sum())
+                row[names.index(a)], row[names.index(b)] = weight, -weight
+                rows.append(row)
+                goals.append(weight * math.log(sums[1] / sums[0]))
+        return np.exp(np.linalg.lstsq(np.array(rows), np.array(goals))[0])
+
+    def disagreement(self, frames: Frames) -> tuple[dict[tuple[str, str], float], np.ndarray]:
+        """How much the cameras differ where they overlap: a free check of the poses and lenses.
+
+        Returns:
+            The mean difference of each pair, in units of the frames; and the largest at each pixel
+            of the view, (H', W') float32, NaN where fewer than two cameras see it.
+        """
+        picture = np.full(self._count, np.nan, np.float32)
+        means = {}
+        for pair, ((x, y), (first, second)) in (
+            (names, (places.T, values)) for names, (places, values) in self.overlaps(frames).items()
+        ):
+            apart = np.abs(first - second).mean(1)
+            means[pair] = float(apart.mean())
+            at = y * self.view_size[1] + x
+            picture[at] = np.fmax(picture[at], apart)
+        return means, picture.reshape(self.view_size)
+
+    # -- programs -----------------------------------------------------------------------------
+
+    def sampler(
+        self, output: Literal["uint8", "image"] = "uint8", *, gains: Any = None,
+        mean: PerChannel | None = None, std: PerChannel | None = None,
+    ) -> "Sampler":  # fmt: skip
+        """A `darswin.frames.Sampler` of the cameras' frames; arguments: see `plan`."""
+        from darswin.frames.plans import Sampler
+
+        return Sampler(self.plan(output, gains=gains, mean=mean, std=std))
+
+    def plan(
+        self, output: Literal["uint8", "image"] = "uint8", *, gains: Any = None,
+        mean: PerChannel | None = None, std: PerChannel | None = None,
+    ) -> "RigPlan":  # fmt: skip
+        """The points at which the cameras' frames are read, for `darswin.frames.Sampler`.
+
+        Args:
+            output, mean, std: see `Remap.plan`.
+            gains: (n,), a factor for each camera, such as those of `gains`.
+        """
+        from darswin.frames.rig_plans import RigPlan  # the compiled module
+
+        mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
+        if output == "uint8":
+            mean, std = 0.0, 1.0
+        if mean is None or std is None:
+            raise ValueError("frames are normalized: give the mean and the std of the network")
+        channels = max(np.size(mean), np.size(std))
+        reads, sizes = self.reads, [camera.size for camera in self.rig.cameras.values()]
+        factors = np.asarray(np.ones(len(sizes)) if gains is None else gains, np.float32)
+        columns, rows, right, lower = corners(reads.points, np.array(sizes)[reads.sources].T)
+        return RigPlan(
+            counts=np.bincount(reads.pixels, minlength=self._count)
+            .astype(np.uint16).reshape(self.view_size),
+            sources=reads.sources, columns=columns.astype(np.int16), rows=rows.astype(np.int16),
+            right=right.astype(np.float32), lower=lower.astype(np.float32),
+            weights=reads.weights * factors[reads.sources], sizes=tuple(sizes),
+            names=self.rig.names, output=output, mean=per_channel("mean", mean, channels),
+            std=per_channel("std", std, channels),
+        )  # fmt: skip
+
+    # -- of the rig alone ---------------------------------------------------------------------
+
+    @property
+    def _count(self) -> int:
+        return math.prod(self.view_size)
+
+    @property
+    def _grid(self) -> np.ndarray:
+        return grid(np.arange(self._count), self.view_size, 1)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        """What the cameras see of the middles of all pixels."""
+        seen = see(self.view, self.rig, self.distance, self._grid)
+        shows = [bool((room >= 0).any()) for room in seen.room]
+        if not any(shows):
+            raise ValueError(f"no camera sees anything of the view {self.view}")
+        if self.rig.spread > _ONE_PLACE and not all(shows):
+            names = [n for n, k in zip(self.rig.names, shows, strict=True) if not k]
+            warnings.warn(f"the view shows nothing of {', '.join(names)}", stacklevel=4)
+        return seen
+
+    @cached_property
+    def reads(self) -> Reads:
+        """The points at which the frames are read."""
+        with torch.inference_mode(False), torch.no_grad():
+            return reads_of(self.view, self.rig, self._seen, self.seam, self.distance)
+
+    def _nearest(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """The pixels of the view that a camera shows best, (K,), and its nearest pixels, (2, K)."""
+        room = self._seen.room
+        mine = np.flatnonzero((room.argmax(0) == number) & (room[number] >= 0))
+        points = self._seen.pixels[number, mine] + aside(self.view_size).reshape(-1, 2)[mine]
+        last = np.array(self.source(number).size[::-1]) - 1
+        return mine, np.rint(points.clip(0, last)).astype(np.intp).T
+
+    def _listed(self, frames: Frames, dims: int | None = None) -> list[Any]:
+        """Frames of the cameras in their order; TypeError or ValueError for wrong ones."""
+        names = self.rig.names
+        if isinstance(frames, Mapping):
+            if {*frames} != {*names}:
+                wrong = sorted({*frames} ^ {*names}, key=str)
+                what = "is missing" if wrong[0] in names else f"is no camera of {', '.join(names)}"
+                raise ValueError(f"the frame {wrong[0]!r} {what}")
+            frames = [frames[name] for name in names]
+        if isinstance(frames, np.ndarray | Tensor) or len(frames) != len(names):
+            raise ValueError(
+                f"there must be a frame for each of {len(names)} cameras, got {len(frames)}"
+            )
+        kinds = {(type(f), getattr(f, "dtype", None), np.shape(f)[2:] if isinstance(f, np.ndarray)
+                  else np.shape(f)[:2]) for f in frames}  # fmt: skip
+        if len(kinds) > 1:
+            raise TypeError("all frames must have one type and one number of channels")
+        for name, frame in zip(names, frames, strict=True):
+            if not isinstance(frame, np.ndarray | Tensor):
+                raise TypeError(f"frame {name} must be an array or a tensor, got {type(frame)}")
+            shape, size = tuple(frame.shape), self.rig[name].size
+            tensor = isinstance(frame, Tensor)
+            if (shape[2:] if tensor else shape[:2]) != size or len(shape) > 3 + tensor:
+                raise ValueError(f"frame {name} must be of (H, W) = {size}, got shape {shape}")
+            if dims is not None and (tensor or len(shape) != dims):
+                raise ValueError(f"the map of {name} must be an array (H, W), got shape {shape}")
+            if (
+                dims is None
+                and not tensor
+                and np.dtype(frame.dtype).kind in "iu"
+                and frame.itemsize > 2
+            ):
+                raise TypeError(f"frames of {frame.dtype} would be mixed: remap.target moves ids")
+        return list(frames)
+
+    def _mixed(self, images: list[Tensor], gains: np.ndarray | None) -> Tensor:
+        """The view of images (B, C, H, W) in floating point: (B, C, H', W')."""
+        reads = self.reads
+        mixed = images[0].new_zeros(*images[0].shape[:2], self._count)
+        for number, image in enumerate(images):
+            mine = np.flatnonzero(reads.sources == number)
+            factor = 1.0 if gains is None else gains[number]
+            weights = torch.from_numpy(reads.weights[mine] * np.float32(factor)).to(image)
+            values = read_at(image, reads.points[mine]) * weights
+            mixed = mixed.index_add(
+                2, torch.from_numpy(reads.pixels[mine]).to(image.device), values
+            )
+        return mixed.unflatten(2, self.view_size)
+
+    def __repr__(self) -> str:
+        return f"RigRemap({self.view}, {self.rig})"
