@@ -12,8 +12,9 @@ import torch
 from rigs_peers import Careful, Panorama, Table, Usual
 from rigs_scene import AHEAD, NOTHING, Picture, Scene, picture, rays_of, room
 
-from darswin import CameraView, Rig
+from darswin import Rig
 from darswin.lens import KannalaBrandt, Lens
+from darswin.views import CameraView
 
 FOV, RIM = math.radians(190), math.radians(80)
 SIZE, TRUTH = (256, 256), 16  # px; rays along each side of a pixel
@@ -23,12 +24,16 @@ PHANTOM = 0.01  # of the distance
 TIMED, FRAMES, SIDE = (480, 640), 30, 512
 
 
-def fisheye(size: tuple[int, int], radius: float, fov: float = FOV) -> Lens:
-    """A Kannala–Brandt lens whose field of view fills a circle around the picture's middle."""
+def fisheye(
+    size: tuple[int, int], radius: float, fov: float = FOV, *, curved: bool = True
+) -> Lens:
+    """A Kannala–Brandt lens whose field of view fills a circle around the picture's middle, or an
+    equidistant one."""
+    radial = [[-0.035, 0.001, 0, 0]] if curved else [[0.0] * 4]
     middle = torch.tensor([[(size[1] - 1) / 2, (size[0] - 1) / 2]], dtype=torch.float64)
     lens = KannalaBrandt(
         focal=torch.ones(1, dtype=torch.float64), center=middle, image_size=size,
-        radial=torch.tensor([[-0.01, 0.001, 0, 0]], dtype=torch.float64),
+        radial=torch.tensor(radial, dtype=torch.float64),
     )  # fmt: skip
     scale = radius / lens.with_theta_max(None).project(fov / 2)
     return lens.replace(focal=scale).with_theta_max(fov / 2)

@@ -305,11 +305,11 @@ def room(seed: int = 74) -> Scene:
     """A room of 9 × 6.5 × 3.1 m with four poles of 8 cm and twelve things, at 1 to 6 m."""
     rng = np.random.default_rng(seed)
     wall = Paint(0.25, (205, 190, 150), (120, 140, 170), spread=70)
-    things: list = [Box((0.5, -0.25, 0.05), (9.0, 6.5, 3.1), wall, 0, inside=True)]
+    things: list = [Box((0.53, -0.31, 0.07), (9.0, 6.5, 3.1), wall, 0, inside=True)]
     stripes = Paint(0.1, (240, 240, 240), (25, 25, 25), striped=True)
     for angle, far in ((-92, 1.6), (-50, 2.2), (25, 1.3), (88, 2.4)):
         x, y = far * math.cos(math.radians(angle)), far * math.sin(math.radians(angle))
-        things.append(Cylinder((x, y, 0.05), 0.04, 3.1, stripes, len(things) + 6))
+        things.append(Cylinder((x, y, 0.07), 0.04, 3.1, stripes, len(things) + 6))
     for number in range(12):
         angle = 2 * math.pi * (number + rng.uniform(0.2, 0.8)) / 12
         far, size = rng.uniform(1.1, 2.6), rng.uniform(0.18, 0.35)
