@@ -1,5 +1,5 @@
-// The interface between darswin.frames and its kernels, which sample one 8-bit frame at the places
-// of a plan. Nothing here uses torch.
+// The interface between darswin.frames and its kernels, which sample 8-bit frames at the places of
+// a plan. Nothing here uses torch.
 #pragma once
 
 #include "polar.h"
@@ -9,6 +9,11 @@ namespace darswin {
 // The memory of the samples: (pixels, C) or (C, pixels) float32, or (pixels, C) uint8. If the
 // output has several pictures, they follow each other.
 enum class FrameOutput { tokens, planes, bytes };
+struct FrameTarget {
+  FrameOutput output;
+  int64_t channels, pixels;  // of one picture
+  void* out;
+};
 
 struct ByteImage {
   const uint8_t* pixels;  // (H, W, C), with C = 1 or 3
@@ -41,15 +46,40 @@ struct FrameArgs {
   const int16_t *columns, *rows;
   const float *right, *lower;  // distances from that pixel, 0 to 1
   int64_t reads;      // points of a pixel of the output, one after the other: it is their mean
-  int64_t pixels;     // of one picture of the output
   PixelRuns seen;     // all pixels that see something of the frame, and those in short gaps
   PixelRuns outside;  // all pixels that see nothing
   const BorderPoint* border;
   int64_t border_points;
-  FrameOutput output;
-  void* out;
+  FrameTarget to;
 };
 constexpr int64_t kFrameSpare = 16;
+
+// Pixels of a rig's output that follow each other and have kRigReads reads at most, or one with
+// more, or any number of pixels without reads. The next group begins where this one ends.
+struct RigGroup {
+  int64_t pixel, read, run;
+};
+constexpr int64_t kRigReads = 256;
+
+// Reads of one source that follow each other in a group.
+struct RigRun {
+  int32_t count;
+  uint8_t source;
+  bool in_order;  // they belong to pixels that follow each other
+};
+
+// A pixel is the sum of its reads, which are bilinear samples times their weights.
+struct RigArgs {
+  const ByteImage* images;  // of the sources; they are not normalized
+  // Of the reads as in FrameArgs, with their weights, and the number of their pixel in the group.
+  const int16_t *columns, *rows;
+  const float *right, *lower, *weights;
+  const uint8_t* pixels;
+  const RigGroup* groups;  // one that begins at the end is the last
+  const RigRun* runs;
+  const float *scale, *offset;  // (C,): a sum v becomes v * scale + offset
+  FrameTarget to;
+};
 
 struct FrameKernels {
   // Finds the upper left pixel of each point of a polar grid, and the distances from it, as arrays
@@ -59,6 +89,8 @@ struct FrameKernels {
                  int16_t* rows, float* right, float* lower);
   // Samples pixels [begin, end) of the output on one thread.
   void (*sample)(const FrameArgs& args, int64_t begin, int64_t end);
+  // Samples groups [begin, end) of a rig's output on one thread.
+  void (*sample_rig)(const RigArgs& args, int64_t begin, int64_t end);
 };
 
 // A picture (H, W, C) of uint8_t or float that is read at points of float, 0 outside.

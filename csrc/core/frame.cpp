@@ -10,9 +10,8 @@
 namespace darswin {
 namespace {
 
-constexpr int64_t kMostReads = 16;       // along a side of a pixel: all points fit one block
-constexpr double kPerMicrosecond = 500;  // points, or numbers of a frame that are normalized
-constexpr int64_t kShortGap = 8;         // points: to sample them takes less than to skip them
+constexpr int64_t kMostReads = 16;  // along a side of a pixel: all points fit one block
+constexpr int64_t kShortGap = 8;    // points: to sample them takes less than to skip them
 
 int64_t length(const std::vector<PixelRun>& runs) {
   return runs.empty() ? 0 : runs.back().before + runs.back().end - runs.back().begin;
@@ -38,6 +37,44 @@ std::string shown(int64_t height, int64_t width) {
 
 }  // namespace
 
+void check_frame(const Frame& frame, int64_t height, int64_t width, size_t channels,
+                 const std::string& what) {
+  if (frame.height != height || frame.width != width) {
+    throw std::invalid_argument(what + " must be of the plan's size, (H, W) = " +
+                                shown(height, width) + ", got " + shown(frame.height, frame.width));
+  }
+  const bool known = frame.channels == 1 || frame.channels == 3;
+  if (!known || (channels > 1 && frame.channels != static_cast<int64_t>(channels))) {
+    throw std::invalid_argument(what + " must have the plan's " + std::to_string(channels) +
+                                " channels, got " + std::to_string(frame.channels));
+  }
+  const auto span = [](int64_t size, int64_t stride) {
+    return static_cast<double>(size - 1) * std::abs(static_cast<double>(stride));
+  };
+  if (span(height, frame.row_stride) + span(width, frame.column_stride) >= INT32_MAX) {
+    throw std::invalid_argument(what + " must span less than 2 GB of memory");
+  }
+}
+
+ByteImage image_of(const Frame& frame, const float* scale, const float* offset) {
+  return {.pixels = frame.pixels,
+          .height = frame.height,
+          .width = frame.width,
+          .channels = frame.channels,
+          .row_stride = frame.height > 1 ? frame.row_stride : 0,
+          .column_stride = frame.width > 1 ? frame.column_stride : 0,
+          .channel_stride = frame.channels > 1 ? frame.channel_stride : 0,
+          .scale = scale,
+          .offset = offset};
+}
+
+std::optional<FrameOutput> output_of(const std::string& name) {
+  if (name == "tokens") return FrameOutput::tokens;
+  if (name == "image") return FrameOutput::planes;
+  if (name == "uint8") return FrameOutput::bytes;
+  return {};
+}
+
 FrameSampler::FrameSampler(const FramePlan& plan)
     : reads(plan.reads >= 1 && plan.reads <= kMostReads ? plan.reads * plan.reads : 0),
       shape(plan.shape.begin(), plan.shape.end() - (plan.reads > 1 && !plan.shape.empty())),
@@ -46,20 +83,18 @@ FrameSampler::FrameSampler(const FramePlan& plan)
       scale(plan.scale),
       offset(plan.offset) {
   const size_t points = plan.columns.size();
-  const bool tokens = plan.output == "tokens",
-             known = tokens || plan.output == "image" || plan.output == "uint8";
+  const auto output = output_of(plan.output);
+  const bool tokens = output == FrameOutput::tokens;
   const bool sizes = height > 0 && width > 0 && height <= INT16_MAX && width <= INT16_MAX;
   const bool channels = scale.size() == 1 || scale.size() == 3;
   const bool axes =
       tokens ? shape.size() == 4 && reads == 1 : shape.size() == 2 || shape.size() == 3;
-  if (!known || !sizes || !channels || scale.size() != offset.size() || reads < 1 || !axes ||
+  if (!output || !sizes || !channels || scale.size() != offset.size() || reads < 1 || !axes ||
       (reads > 1 && plan.shape.back() != reads) || plan.rows.size() != points ||
       plan.right.size() != points || plan.lower.size() != points) {
     throw std::invalid_argument("the parts of the plan do not fit together");
   }
-  kind = tokens                   ? FrameOutput::tokens
-         : plan.output == "image" ? FrameOutput::planes
-                                  : FrameOutput::bytes;
+  kind = *output;
   for (size_t k = 0; k < points; ++k) {
     const float x = plan.right[k], y = plan.lower[k];
     if (!(x >= 0 && x <= 1 && y >= 0 && y <= 1)) {
@@ -115,57 +150,29 @@ std::vector<int64_t> FrameSampler::output_shape(int64_t channels, bool has_axis)
   return sizes;
 }
 
-void FrameSampler::check(const Frame& frame) const {
-  if (frame.height != height || frame.width != width) {
-    throw std::invalid_argument("frame must be of the plan's size, (H, W) = " +
-                                shown(height, width) + ", got " + shown(frame.height, frame.width));
-  }
-  const bool known = frame.channels == 1 || frame.channels == 3;
-  if (!known || (scale.size() > 1 && frame.channels != static_cast<int64_t>(scale.size()))) {
-    throw std::invalid_argument("frame must have the plan's " + std::to_string(scale.size()) +
-                                " channels, got " + std::to_string(frame.channels));
-  }
-  const auto span = [](int64_t size, int64_t stride) {
-    return static_cast<double>(size - 1) * std::abs(static_cast<double>(stride));
-  };
-  if (span(height, frame.row_stride) + span(width, frame.column_stride) >= INT32_MAX) {
-    throw std::invalid_argument("frame must span less than 2 GB of memory");
-  }
-}
-
-ByteImage FrameSampler::image_of(const Frame& frame, float* scales, float* offsets) const {
-  for (int c = 0; c < 3; ++c) {  // bytes are not normalized
+void FrameSampler::normalization(float* scales, float* offsets) const {
+  for (int c = 0; c < 3; ++c) {
     const size_t at = scale.size() > 1 ? c : 0;
     scales[c] = makes_bytes() ? 1 : scale[at];
     offsets[c] = makes_bytes() ? 0 : offset[at];
   }
-  return {.pixels = frame.pixels,
-          .height = height,
-          .width = width,
-          .channels = frame.channels,
-          .row_stride = height > 1 ? frame.row_stride : 0,
-          .column_stride = width > 1 ? frame.column_stride : 0,
-          .channel_stride = frame.channels > 1 ? frame.channel_stride : 0,
-          .scale = scales,
-          .offset = offsets};
 }
 
 void FrameSampler::sample(const Frame& frame, void* out) const {
   float scales[3], offsets[3];
   FrameArgs a{};
+  normalization(scales, offsets);
   a.image = image_of(frame, scales, offsets);
   a.columns = columns.data(), a.rows = rows.data();
   a.right = right.data(), a.lower = lower.data();
-  a.reads = reads, a.pixels = picture;
+  a.reads = reads;
   a.seen = runs_of(seen), a.outside = runs_of(outside);
   a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
-  a.output = kind;
-  a.out = out;
+  a.to = {kind, frame.channels, picture, out};
   const auto& kernel = kernels<FrameKernels>();
   const int64_t work = length(seen);
   // Threads share what is seen. The rest hardly takes time.
-  parallel_ranges(std::max<int64_t>(work, 1),
-                  threads_for(static_cast<double>(work * reads) / kPerMicrosecond),
+  parallel_ranges(std::max<int64_t>(work, 1), threads_for(frame_microseconds(work * reads)),
                   [&](int64_t begin, int64_t end) {
                     kernel.sample(a, begin > 0 ? pixel_after(begin) : 0,
                                   end < work ? pixel_after(end) : pixels);
@@ -174,6 +181,7 @@ void FrameSampler::sample(const Frame& frame, void* out) const {
 
 void FrameSampler::normalize(const Frame& frame, float* out) const {
   float scales[3], offsets[3];
+  normalization(scales, offsets);
   const ByteImage image = image_of(frame, scales, offsets);
   const int64_t numbers = width * image.channels;
   const auto rows_of = [&](int64_t begin, int64_t end) {
@@ -187,8 +195,7 @@ void FrameSampler::normalize(const Frame& frame, float* out) const {
       }
     }
   };
-  parallel_ranges(height, threads_for(static_cast<double>(height) * numbers / kPerMicrosecond),
-                  rows_of);
+  parallel_ranges(height, threads_for(frame_microseconds(height * numbers)), rows_of);
 }
 
 }  // namespace darswin

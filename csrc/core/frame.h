@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
@@ -17,6 +18,19 @@ struct Frame {
   int64_t height, width, channels;
   int64_t row_stride, column_stride, channel_stride;
 };
+
+// Throws std::invalid_argument if a frame, called `what`, has not this size, or neither so many
+// channels nor, with `channels` = 1, one or three.
+void check_frame(const Frame& frame, int64_t height, int64_t width, size_t channels,
+                 const std::string& what = "frame");
+// A checked frame. It keeps the pointers.
+ByteImage image_of(const Frame& frame, const float* scale, const float* offset);
+
+// The output of this name, or nothing.
+std::optional<FrameOutput> output_of(const std::string& name);
+
+// Returns about how long it takes to sample so many points, or to normalize so many numbers.
+inline double frame_microseconds(int64_t count) { return static_cast<double>(count) / 500; }
 
 // The arrays of a plan.
 struct FramePlan {
@@ -42,15 +56,15 @@ class FrameSampler {
   std::vector<int64_t> output_shape(int64_t channels, bool has_axis = true) const;
 
   // Throws std::invalid_argument if a frame does not fit the plan.
-  void check(const Frame& frame) const;
+  void check(const Frame& frame) const { check_frame(frame, height, width, scale.size()); }
   // Writes the samples of a checked frame, on at most num_threads() threads.
   void sample(const Frame& frame, void* out) const;
   // Writes all pixels of a checked frame, normalized: (H, W, C).
   void normalize(const Frame& frame, float* out) const;
 
  private:
-  // A checked frame. It keeps pointers to the arrays of 3 numbers.
-  ByteImage image_of(const Frame& frame, float* scale, float* offset) const;
+  // Numbers for 3 channels. Bytes are not normalized.
+  void normalization(float* scale, float* offset) const;
 
   // The pixel of `seen` before which so many others come.
   int64_t pixel_after(int64_t count) const;

@@ -100,7 +100,8 @@ uint32_t crc_of(std::string_view bytes) {
 int64_t size_of(std::string_view type) {
   if (type == "I64" || type == "F64") return 8;
   if (type == "I32" || type == "F32") return 4;
-  return type == "I16" ? 2 : type == "U8" ? 1 : 0;
+  if (type == "I16" || type == "U16") return 2;
+  return type == "U8" ? 1 : 0;
 }
 
 // Adds a character to a text in UTF-8.

@@ -6,14 +6,17 @@ namespace {
 
 constexpr int64_t kPart = 16384;  // pixels that stay in the cache while several loops write to them
 
-// Finds the offsets of points [first, first + count).
-void find_offsets(const FrameArgs& a, int64_t first, int64_t count, int32_t* offset) {
-  const auto row_stride = static_cast<int32_t>(a.image.row_stride),
-             column_stride = static_cast<int32_t>(a.image.column_stride);
+// Samples points [first, first + count) of the places of `a` in an image.
+template <typename Args>
+void sample_block(const ByteImage& image, const Args& a, int64_t first, int64_t count,
+                  ByteBlock& block) {
+  const auto row_stride = static_cast<int32_t>(image.row_stride),
+             column_stride = static_cast<int32_t>(image.column_stride);
 #pragma omp simd
   for (int64_t k = 0; k < count; ++k) {
-    offset[k] = a.rows[first + k] * row_stride + a.columns[first + k] * column_stride;
+    block.offset[k] = a.rows[first + k] * row_stride + a.columns[first + k] * column_stride;
   }
+  block.sample(image, a.right + first, a.lower + first, count);
 }
 
 // Rounds a sample to 8 bits. The sum of rounded weights may be a little above 1.
@@ -22,9 +25,9 @@ inline uint8_t to_byte(float sample) {
 }
 
 // The place of channel c of a pixel among planes.
-inline int64_t in_planes(const FrameArgs& a, int64_t pixel, int64_t c) {
-  const int64_t picture = pixel / a.pixels;
-  return (picture * a.image.channels + c) * a.pixels + pixel - picture * a.pixels;
+inline int64_t in_planes(const FrameTarget& to, int64_t pixel, int64_t c) {
+  const int64_t picture = pixel / to.pixels;
+  return (picture * to.channels + c) * to.pixels + pixel - picture * to.pixels;
 }
 
 // Replaces the samples of a block by the mean of each pixel's.
@@ -39,43 +42,45 @@ void average(const FrameArgs& a, int64_t count, ByteBlock& block) {
   }
 }
 
-// Writes the pixels of a block, which are in one picture, to the output.
-void write_block(const FrameArgs& a, int64_t first, int64_t count, const ByteBlock& block) {
-  const int64_t channels = a.image.channels;
-  if (a.output == FrameOutput::tokens) {
-    return block.write(channels, count, static_cast<float*>(a.out) + first * channels);
+// Writes samples of each channel, the pixels of a block in one picture.
+void write_block(const FrameTarget& to, int64_t first, int64_t count,
+                 const float (&samples)[3][kByteBlock]) {
+  const int64_t channels = to.channels;
+  if (to.output == FrameOutput::tokens && channels == 3) {
+    return ByteBlock::interleave(samples[0], samples[1], samples[2], count,
+                                 static_cast<float*>(to.out) + first * channels);
   }
-  if (a.output == FrameOutput::planes) {
+  if (to.output != FrameOutput::bytes) {  // tokens of one channel too
     for (int64_t c = 0; c < channels; ++c) {
-      copy(block.samples[c], count, static_cast<float*>(a.out) + in_planes(a, first, c));
+      copy(samples[c], count, static_cast<float*>(to.out) + in_planes(to, first, c));
     }
     return;
   }
   uint8_t bytes[3][kByteBlock];
   for (int64_t c = 0; c < channels; ++c) {
 #pragma omp simd
-    for (int64_t k = 0; k < count; ++k) bytes[c][k] = to_byte(block.samples[c][k]);
+    for (int64_t k = 0; k < count; ++k) bytes[c][k] = to_byte(samples[c][k]);
   }
-  uint8_t* to = static_cast<uint8_t*>(a.out) + first * channels;
+  uint8_t* out = static_cast<uint8_t*>(to.out) + first * channels;
   if (channels == 1) {
-    __builtin_memcpy(to, bytes[0], static_cast<size_t>(count));
+    __builtin_memcpy(out, bytes[0], static_cast<size_t>(count));
   } else {
-    ByteBlock::interleave(bytes[0], bytes[1], bytes[2], count, to);
+    ByteBlock::interleave(bytes[0], bytes[1], bytes[2], count, out);
   }
 }
 
 // Writes zeros to so many pixels of one picture.
-void write_zeros(const FrameArgs& a, int64_t first, int64_t count) {
-  const int64_t channels = a.image.channels;
-  if (a.output == FrameOutput::planes) {
-    float* plane = static_cast<float*>(a.out) + in_planes(a, first, 0);
+void write_zeros(const FrameTarget& to, int64_t first, int64_t count) {
+  const int64_t channels = to.channels;
+  if (to.output == FrameOutput::planes) {
+    float* plane = static_cast<float*>(to.out) + in_planes(to, first, 0);
     for (int64_t c = 0; c < channels; ++c) {
-      __builtin_memset(plane + c * a.pixels, 0, static_cast<size_t>(count) * sizeof(float));
+      __builtin_memset(plane + c * to.pixels, 0, static_cast<size_t>(count) * sizeof(float));
     }
     return;
   }
-  const int64_t bytes = channels * (a.output == FrameOutput::bytes ? 1 : sizeof(float));
-  __builtin_memset(static_cast<uint8_t*>(a.out) + first * bytes, 0,
+  const int64_t bytes = channels * (to.output == FrameOutput::bytes ? 1 : sizeof(float));
+  __builtin_memset(static_cast<uint8_t*>(to.out) + first * bytes, 0,
                    static_cast<size_t>(count * bytes));
 }
 
@@ -89,12 +94,12 @@ void write_border(const FrameArgs& a, const BorderPoint* points) {
       v += border_sample(a.image, p.column, p.row, p.right, p.lower, c);
     }
     v *= 1.0f / static_cast<float>(a.reads);
-    if (a.output == FrameOutput::planes) {
-      static_cast<float*>(a.out)[in_planes(a, k, c)] = v;
-    } else if (a.output == FrameOutput::tokens) {
-      static_cast<float*>(a.out)[k * channels + c] = v;
+    if (a.to.output == FrameOutput::planes) {
+      static_cast<float*>(a.to.out)[in_planes(a.to, k, c)] = v;
+    } else if (a.to.output == FrameOutput::tokens) {
+      static_cast<float*>(a.to.out)[k * channels + c] = v;
     } else {
-      static_cast<uint8_t*>(a.out)[k * channels + c] = to_byte(v);
+      static_cast<uint8_t*>(a.to.out)[k * channels + c] = to_byte(v);
     }
   }
 }
@@ -129,17 +134,15 @@ void sample_part(const FrameArgs& a, int64_t begin, int64_t end, ByteBlock& bloc
   const auto sample_run = [&](int64_t pixel, int64_t last, int64_t before) {
     for (int64_t count; pixel < last; pixel += count, before += count) {
       count = smaller(most, last - pixel);
-      const int64_t first = before * a.reads;
-      find_offsets(a, first, count * a.reads, block.offset);
-      block.sample(a.image, a.right + first, a.lower + first, count * a.reads);
+      sample_block(a.image, a, before * a.reads, count * a.reads, block);
       if (a.reads > 1) average(a, count, block);
-      write_block(a, pixel, count, block);
+      write_block(a.to, pixel, count, block.samples);
     }
   };
   // A frame of one row or column has no four neighbours: all that it shows are border points.
   if (a.image.height > 1 && a.image.width > 1) for_runs(a.seen, begin, end, sample_run);
   for_runs(a.outside, begin, end,
-           [&](int64_t pixel, int64_t last, int64_t) { write_zeros(a, pixel, last - pixel); });
+           [&](int64_t pixel, int64_t last, int64_t) { write_zeros(a.to, pixel, last - pixel); });
   const BorderPoint* last = a.border + a.border_points;
   const auto is_in = [&](const BorderPoint& point) { return point.pixel >= begin; };
   for (const BorderPoint* point = first_of(a.border, a.border_points, is_in);
@@ -153,6 +156,49 @@ void sample(const FrameArgs& a, int64_t begin, int64_t end) {
   for (int64_t next; begin < end; begin = next) {
     next = smaller(begin + kPart, end);
     sample_part(a, begin, next, block);
+  }
+}
+
+// Adds the weighted samples of a block to the sums of a group's pixels.
+void add_block(const RigArgs& a, bool in_order, int64_t first, int64_t count,
+               const ByteBlock& block, float (&sums)[3][kByteBlock]) {
+  const float* weights = a.weights + first;
+  const uint8_t* pixels = a.pixels + first;
+  for (int64_t c = 0; c < a.to.channels; ++c) {
+    const float* samples = block.samples[c];
+    float* sum = sums[c] + (in_order ? pixels[0] : 0);
+    if (in_order) {
+#pragma omp simd
+      for (int64_t k = 0; k < count; ++k) sum[k] += weights[k] * samples[k];
+    } else {
+      for (int64_t k = 0; k < count; ++k) sum[pixels[k]] += weights[k] * samples[k];
+    }
+  }
+}
+
+void sample_rig(const RigArgs& a, int64_t begin, int64_t end) {
+  alignas(64) ByteBlock block;
+  alignas(64) float sums[3][kByteBlock];
+  for (const RigGroup* group = a.groups + begin; group < a.groups + end; ++group) {
+    const int64_t count = group[1].pixel - group->pixel;
+    if (group->run == group[1].run) {
+      write_zeros(a.to, group->pixel, count);
+      continue;
+    }
+    __builtin_memset(sums, 0, sizeof sums);
+    int64_t read = group->read;
+    for (const RigRun* run = a.runs + group->run; run < a.runs + group[1].run; ++run) {
+      for (int64_t left = run->count, next; left > 0; left -= next, read += next) {
+        next = smaller(kByteBlock, left);
+        sample_block(a.images[run->source], a, read, next, block);
+        add_block(a, run->in_order, read, next, block, sums);
+      }
+    }
+    for (int64_t c = 0; c < a.to.channels && a.to.output != FrameOutput::bytes; ++c) {
+#pragma omp simd
+      for (int64_t k = 0; k < count; ++k) sums[c][k] = sums[c][k] * a.scale[c] + a.offset[c];
+    }
+    write_block(a.to, group->pixel, count, sums);
   }
 }
 
@@ -234,7 +280,7 @@ void read_rows(const ReadArgs<T>& a, int64_t rows) {
 
 }  // namespace
 
-TIER_TABLE(FrameKernels) = {.places = places, .sample = sample};
+TIER_TABLE(FrameKernels) = {.places = places, .sample = sample, .sample_rig = sample_rig};
 TIER_TABLE(ReadKernels<uint8_t>) = {read_rows<1>, read_rows<3>, read_rows<4>};
 TIER_TABLE(ReadKernels<float>) = {read_rows<1>, read_rows<3>, read_rows<4>};
 

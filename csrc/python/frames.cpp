@@ -17,6 +17,7 @@
 #include "../core/dispatch.h"
 #include "../core/network_file.h"
 #include "../core/parallel.h"
+#include "../core/rig.h"
 
 // glibc 2.34 gave the same function a new version (see portable.cpp).
 #if defined(__GLIBC__) && defined(__x86_64__)
@@ -58,10 +59,10 @@ std::span<const T> span_of(const Array<T>& array) {
   return {array.data(), static_cast<size_t>(array.size())};
 }
 
-// Checks for an array (H, W), (H, W, 1) or (H, W, 3) of uint8.
-Frame frame_of(const py::object& given) {
+// Checks for an array (H, W), (H, W, 1) or (H, W, 3) of uint8, called `what`.
+Frame frame_of(const py::object& given, const std::string& what = "frame") {
   if (!py::isinstance<py::array_t<uint8_t>>(given)) {
-    throw py::type_error("frame must be a NumPy array of uint8, got " +
+    throw py::type_error(what + " must be a NumPy array of uint8, got " +
                          std::string(py::isinstance<py::array>(given)
                                          ? py::str(given.attr("dtype"))
                                          : py::str(py::type::of(given))));
@@ -71,7 +72,7 @@ Frame frame_of(const py::object& given) {
   const bool colors = sizes.size() == 3;
   const int64_t channels = colors ? sizes[2] : 1;
   if ((sizes.size() != 2 && !colors) || (channels != 1 && channels != 3)) {
-    throw py::value_error("frame must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
+    throw py::value_error(what + " must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
                           shown(sizes));
   }
   return {.pixels = static_cast<const uint8_t*>(frame.data()),
@@ -88,9 +89,9 @@ void check_threads(int64_t threads) {
 }
 
 // The array for a result of this type and these sizes: a new one, or the given one if it fits and
-// shares no memory with the frame.
+// shares no memory with the frames.
 template <typename T>
-py::array output_array(const py::object& given, const Shape& sizes, const py::object& frame) {
+py::array output_array(const py::object& given, const Shape& sizes, const py::tuple& frames) {
   if (given.is_none()) return py::array(py::dtype::of<T>(), sizes);
   if (!py::isinstance<py::array>(given)) {
     throw py::type_error("out must be a NumPy array, got " +
@@ -102,25 +103,28 @@ py::array output_array(const py::object& given, const Shape& sizes, const py::ob
     throw py::value_error("out must be a writeable, C-contiguous array of " +
                           std::string(py::str(py::dtype::of<T>())) + " with shape " + shown(sizes));
   }
-  if (share_memory(py::reinterpret_borrow<py::array>(frame), out)) {
-    throw py::value_error("out must not share memory with the frame");
+  for (const py::handle frame : frames) {
+    if (share_memory(py::reinterpret_borrow<py::array>(frame), out)) {
+      throw py::value_error("out must not share memory with the frame");
+    }
   }
   return out;
 }
 
-py::array sample(const FrameSampler& sampler, const py::object& given, const py::object& out,
-                 int64_t threads) {
-  const Frame frame = frame_of(given);
+// Samples checked frames, of which `given` are the arrays.
+template <typename Sampler, typename Frames>
+py::array sample(const Sampler& sampler, const Frames& frames, int64_t channels,
+                 const py::tuple& given, const py::object& out, int64_t threads) {
   check_threads(threads);
-  sampler.check(frame);
-  const bool colors = py::reinterpret_borrow<py::array>(given).ndim() == 3;
-  const Shape sizes = sampler.output_shape(frame.channels, colors);
+  sampler.check(frames);
+  const bool colors = py::reinterpret_borrow<py::array>(given[0]).ndim() == 3;
+  const Shape sizes = sampler.output_shape(channels, colors);
   py::array result = sampler.makes_bytes() ? output_array<uint8_t>(out, sizes, given)
                                            : output_array<float>(out, sizes, given);
   void* const to = result.mutable_data();
   const py::gil_scoped_release free;
   const ThreadLimit limit(threads);
-  sampler.sample(frame, to);
+  sampler.sample(frames, to);
   return result;
 }
 
@@ -140,7 +144,7 @@ py::object run_network(const FrameNetwork& network, const py::object& given, con
   }
   for (int64_t k = 0; k < count; ++k) {
     const py::object one = is_list && !out.is_none() ? py::object(out[py::int_(k)]) : out;
-    py::array result = output_array<float>(one, network.output_shape(k), given);
+    py::array result = output_array<float>(one, network.output_shape(k), py::make_tuple(given));
     for (const py::handle other : results) {
       if (share_memory(py::reinterpret_borrow<py::array>(other), result)) {
         throw py::value_error("the arrays of out must not share memory");
@@ -285,9 +289,42 @@ PYBIND11_MODULE(_frames, m) {
                   .reads = reads});
     return py::cpp_function(
         [sampler](const py::object& frame, const py::object& out, int64_t threads) {
-          return sample(*sampler, frame, out, threads);
+          const Frame checked = frame_of(frame);
+          return sample(*sampler, checked, checked.channels, py::make_tuple(frame), out, threads);
         },
         py::name("sample"), py::arg("frame"), py::arg("out") = py::none(), py::arg("threads") = 1);
+  });
+  m.def("rig_sampler", [](const Array<uint16_t>& counts, const Array<uint8_t>& sources,
+                          const Array<int16_t>& columns, const Array<int16_t>& rows,
+                          const Array<float>& right, const Array<float>& lower,
+                          const Array<float>& weights,
+                          std::vector<std::pair<int64_t, int64_t>> sizes,
+                          std::vector<std::string> names, std::vector<float> scale,
+                          std::vector<float> offset, const std::string& output) {
+    if (counts.ndim() != 2) throw py::value_error("the plan's counts must have shape (H, W)");
+    const auto sampler = std::make_shared<const RigSampler>(RigPlan{.counts = span_of(counts),
+                                                                    .sources = span_of(sources),
+                                                                    .columns = span_of(columns),
+                                                                    .rows = span_of(rows),
+                                                                    .right = span_of(right),
+                                                                    .lower = span_of(lower),
+                                                                    .weights = span_of(weights),
+                                                                    .height = counts.shape(0),
+                                                                    .width = counts.shape(1),
+                                                                    .sizes = std::move(sizes),
+                                                                    .names = std::move(names),
+                                                                    .scale = std::move(scale),
+                                                                    .offset = std::move(offset),
+                                                                    .output = output});
+    return py::cpp_function(
+        [sampler](const py::tuple& frames, const py::object& out, int64_t threads) {
+          std::vector<Frame> checked;
+          for (size_t k = 0; k < sampler->names().size(); ++k) {
+            checked.push_back(frame_of(frames[k], "the frame of " + sampler->names()[k]));
+          }
+          return sample(*sampler, checked, checked[0].channels, frames, out, threads);
+        },
+        py::name("sample"), py::arg("frames"), py::arg("out") = py::none(), py::arg("threads") = 1);
   });
   m.def("network", &open_network);
   m.def("read_tensors", &read_tensors);

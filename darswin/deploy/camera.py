@@ -11,7 +11,8 @@ from torch import nn
 from darswin.deploy.networks import frame_program
 from darswin.deploy.optimize import check_model, fast_copy, references
 from darswin.deploy.program import NoProgramError
-from darswin.frames.plans import Output, Plan, check_output, check_size
+from darswin.frames.plan_files import Output, check_output, check_size
+from darswin.frames.plans import Plan
 from darswin.frames.tensor_file import check_name, write_tensors
 from darswin.lens import Lens
 from darswin.models.base import Model

@@ -11,10 +11,10 @@ from darswin.utils.elf import check_whole
 
 
 class Sample(Protocol):
-    """Samples a frame."""
+    """Samples a frame, or a tuple of those of several cameras."""
 
     def __call__(
-        self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
+        self, frame: Any, out: np.ndarray | None = None, threads: int = 1, /
     ) -> np.ndarray: ...
 
 
@@ -41,6 +41,24 @@ class Frames(Protocol):
         /,
     ) -> Sample:
         """A function that samples frames at the points of a plan."""
+
+    @staticmethod
+    def rig_sampler(
+        counts: np.ndarray,
+        sources: np.ndarray,
+        columns: np.ndarray,
+        rows: np.ndarray,
+        right: np.ndarray,
+        lower: np.ndarray,
+        weights: np.ndarray,
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        scale: Sequence[float],
+        offset: Sequence[float],
+        output: str,
+        /,
+    ) -> Sample:
+        """A function that samples the frames of several cameras at the places of a plan."""
 
     @staticmethod
     def network(

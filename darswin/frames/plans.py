@@ -1,30 +1,21 @@
-"""Plans: where the frames of one camera are read, and the sampler that reads them there."""
+"""Plans: where the frames of one camera are read."""
 
-import math
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, Self, cast, get_args
+from typing import Any, Self
 
 import numpy as np
 
 from darswin.frames.compiled import frames
-from darswin.frames.tensor_file import write_tensors
+from darswin.frames.plan_files import Output, PlanFile, check_output, check_size
 from darswin.utils.tables import read_table
 
-Output = Literal["tokens", "image", "uint8"]
-_VERSION = 5
-_LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
-_KINDS = dict(  # of the arrays of a file
-    size=np.int64, mean=np.float64, std=np.float64, supersampling=np.int64,
-    columns=np.int16, rows=np.int16, right=np.float32, lower=np.float32,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(PlanFile):
     """The places at which the frames of one camera are read, and the form of the result.
 
     Plans are equal if all of their attributes are.
@@ -56,17 +47,12 @@ class Plan:
     std: tuple[float, ...] = (1.0,)
     supersampling: int = 1
 
-    def __post_init__(self) -> None:
-        for name, least in (("mean", -math.inf), ("std", 0.0)):
-            values = tuple(map(float, getattr(self, name)))
-            if len(values) not in (1, 3):
-                raise ValueError(f"a plan needs 1 {name}, or 3 for RGB, got {len(values)}")
-            if not all(least < value < math.inf for value in values):
-                above = " and above 0" * (least == 0)
-                raise ValueError(f"{name} of a plan must be finite{above}, got {values}")
-            object.__setattr__(self, name, values)
-        if len(self.mean) != len(self.std):
-            raise ValueError(f"a plan needs as many means as stds, got {self.mean} and {self.std}")
+    key = "darswin_plan"
+    version = 5
+    kinds = dict(
+        size=np.int64, mean=np.float64, std=np.float64, supersampling=np.int64,
+        columns=np.int16, rows=np.int16, right=np.float32, lower=np.float32,
+    )  # fmt: skip
 
     @classmethod
     def of_points(
@@ -159,19 +145,6 @@ class Plan:
         columns, rows, right, lower = arrays
         return cls(columns, rows, right, lower, size, output, tuple(mean), tuple(std))
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Plan):
-            return NotImplemented
-        others = other.parts()
-        return all(np.array_equal(value, others[name]) for name, value in self.parts().items())
-
-    def parts(self) -> dict[str, Any]:
-        """The attributes by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def __hash__(self) -> int:
-        return hash((self.size, self.output, self.mean, self.std, self.columns.shape))
-
     def points(self, points: np.ndarray, tile: int = 0) -> np.ndarray:
         """Carries pixels of the image to pixels of the frame, as a map for `darswin.boxes`.
 
@@ -202,108 +175,11 @@ class Plan:
         places = places.reshape(-1, height, width, k, k, 2).swapaxes(2, 3)
         return places.reshape(-1, height * k, width * k, 2)
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in
-        ".safetensors".
-
-        Raises:
-            ValueError: the name has another ending, or the plan is larger than 2 GB.
-            OSError: the file cannot be written.
-        """
-        write_tensors(path, self.arrays(), {"darswin_plan": str(_VERSION), "output": self.output})
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The attributes that are numbers, as arrays for a file."""
-        parts = self.parts()
-        return {name: np.asarray(parts[name], kind) for name, kind in _KINDS.items()}
-
     @classmethod
-    def load(cls, path: str | os.PathLike) -> "Plan":
-        """Reads a plan from a file.
-
-        Raises:
-            ValueError: the file is no plan, is damaged, or comes from another version of darswin.
-            OSError: the file cannot be read.
-        """
-        try:
-            arrays, texts = frames.read_tensors(os.fsencode(path))
-            version = int(texts["darswin_plan"])
-            if version > _VERSION:
-                raise ValueError("it comes from a newer version of darswin: update darswin")
-            if version < _VERSION:
-                raise ValueError("it comes from an older version of darswin: make the plan again")
-            for name, kind in _KINDS.items():
-                if arrays[name].dtype != kind:
-                    raise TypeError(f"its array {name!r} has another type")
-            places = {name: arrays[name] for name in ("columns", "rows", "right", "lower")}
-            if len({array.shape for array in places.values()}) > 1:
-                raise ValueError("its places do not fit together")
-            check_output(texts["output"])
-            height, width = check_size(arrays["size"].tolist())
-            return cls(
-                **places,
-                size=(height, width),
-                output=cast(Output, texts["output"]),
-                mean=tuple(arrays["mean"].tolist()),
-                std=tuple(arrays["std"].tolist()),
-                supersampling=arrays["supersampling"].item(),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            what = f"{error} is missing" if isinstance(error, KeyError) else error
-            raise ValueError(
-                f"{os.fspath(path)} is no plan that darswin.frames can read: {what}"
-            ) from error
-
-
-def check_output(output: str) -> None:
-    """ValueError unless the output is one of a plan."""
-    if output not in get_args(Output):
-        raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
-
-
-def check_size(size: tuple[int, int]) -> tuple[int, int]:
-    """(H, W) of frames; ValueError if a side is longer than a plan can have."""
-    if max(size) > _LARGEST_SIDE:
-        raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
-    return size
-
-
-class Sampler:
-    """Samples frames at the points of a plan: `sampler(frame, out=None, threads=1)`.
-
-    A call takes a frame of uint8, (H, W, 3) or (H, W), in any memory layout, so that
-    `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It
-    runs without Python's lock, and several threads may call one sampler.
-
-    `out` is an array for the result: C-contiguous, with its shape and type, and in other memory
-    than the frame. `threads` is the most threads to use; small plans use fewer. The tokens and the
-    polar image are those of `darswin.ops.polar_sample`, bit for bit.
-
-    Args:
-        plan: a `Plan`, or its file.
-
-    Raises:
-        TypeError: in a call, the frame is no array of uint8.
-        ValueError: the plan is damaged; in a call, the frame or `out` does not fit the plan, or
-            they share memory.
-        OSError: the file cannot be read.
-    """
-
-    def __init__(self, plan: Plan | str | os.PathLike):
-        if not isinstance(plan, Plan):
-            plan = Plan.load(plan)
-        try:
-            self._sample = frames.sampler(
-                plan.columns, plan.rows, plan.right, plan.lower, plan.size,
-                [1 / (255 * std) for std in plan.std],
-                [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
-                plan.output, plan.supersampling,
-            )  # fmt: skip
-        except TypeError as error:
-            raise ValueError("the parts of the plan do not fit together") from error
-        self.plan = plan
-
-    def __call__(
-        self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
-    ) -> np.ndarray:
-        return self._sample(frame, out, threads)
+    def of_file(cls, parts: dict[str, Any], texts: dict[str, str]) -> Self:
+        if len({parts[name].shape for name in ("columns", "rows", "right", "lower")}) > 1:
+            raise ValueError("its places do not fit together")
+        height, width = check_size(parts["size"].tolist())
+        return cls(
+            **parts | dict(size=(height, width), supersampling=parts["supersampling"].item())
+        )

@@ -15,7 +15,7 @@ import numpy as np
 from darswin.utils.files import replace_file
 
 _ENDING = ".safetensors"
-_TYPES = {"u1": "U8", "i2": "I16", "i4": "I32", "i8": "I64", "f4": "F32", "f8": "F64"}
+_TYPES = {"u1": "U8", "u2": "U16", "i2": "I16", "i4": "I32", "i8": "I64", "f4": "F32", "f8": "F64"}
 _LINE = 64  # long arrays begin at multiples of it
 _MOST_BYTES, _MOST_HEADER = 2**31, 2**21
 

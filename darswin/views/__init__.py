@@ -4,7 +4,6 @@ import importlib
 import pkgutil
 
 from darswin.views.base import (
-    PixelGrid,
     PolarGrid,
     View,
 )
@@ -23,7 +22,6 @@ from darswin.views.plain import PlainView
 from darswin.views.polar import PolarView
 from darswin.views.registry import list_views, make_view, register_view
 from darswin.views.remap import Remap
-from darswin.views.rig import RigRemap
 from darswin.views.square import SquareView
 from darswin.views.stereographic import StereographicView
 from darswin.views.tiles import TilesView
@@ -38,14 +36,12 @@ __all__ = [
     "MercatorView",
     "PanoramaView",
     "PerspectiveView",
-    "PixelGrid",
     "PixelView",
     "PlainView",
     "PolarGrid",
     "PolarView",
     "RayView",
     "Remap",
-    "RigRemap",
     "SquareView",
     "StereographicView",
     "TilesView",

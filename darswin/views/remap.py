@@ -20,7 +20,8 @@ from darswin.views.floor import on_floor
 from darswin.views.orientation import Vector
 
 if TYPE_CHECKING:
-    from darswin.frames.plans import Plan, Sampler
+    from darswin.frames.plans import Plan
+    from darswin.frames.sampler import Sampler
 
 Points = TypeVar("Points", np.ndarray, Tensor)
 Value = TypeVar("Value")
@@ -262,7 +263,7 @@ class Remap:
         std: PerChannel | None = None,
     ) -> "Sampler":  # fmt: skip
         """A `darswin.frames.Sampler` of the camera's frames; arguments: see `plan`."""
-        from darswin.frames.plans import Sampler
+        from darswin.frames.sampler import Sampler
 
         return Sampler(self.plan(output, mean=mean, std=std))
 
@@ -276,7 +277,8 @@ class Remap:
             output: "uint8" or "image", see `Plan`.
             mean, std: the normalization of "image"; the default is the view's.
         """
-        from darswin.frames.plans import Plan, check_output, check_size  # the compiled module
+        from darswin.frames.plan_files import check_output, check_size  # the compiled module
+        from darswin.frames.plans import Plan
 
         check_output(output)
         check_size(self.size)

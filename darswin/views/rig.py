@@ -3,9 +3,8 @@
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -19,17 +18,36 @@ from darswin.utils.parameters import check
 from darswin.utils.tasks import IGNORE
 from darswin.views.base import Pair, PerChannel, View
 from darswin.views.remap import Remap, aside
-from darswin.views.rig_reads import Reads, Seam, Seen, corners, grid, read_at, reads_of, see
+from darswin.views.rig_reads import (
+    Frames,
+    Reads,
+    Seam,
+    Seen,
+    corners,
+    grid,
+    in_order,
+    read_at,
+    reads_of,
+    see,
+)
 
 if TYPE_CHECKING:
-    from darswin.frames.plans import Sampler
     from darswin.frames.rig_plans import RigPlan
-
-Frames = Sequence[Any] | Mapping[str, Any]
+    from darswin.frames.sampler import Sampler
 
 _ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
 _ONE_PLACE = 1e-6  # m
 _GREY = (4, 251)  # of 8 bits: what is darker or lighter says nothing about gains
+
+
+class Middles(NamedTuple):
+    """The pixels (K,) of a view that one camera shows best; the pixels nearest to their middles,
+    (K, 2), in its picture; their `corners`; and the cosines (K,) of the rays to its axis."""
+
+    mine: np.ndarray
+    nearest: np.ndarray
+    corners: tuple[np.ndarray, ...]
+    cosines: np.ndarray
 
 
 class RigRemap:
@@ -125,13 +143,13 @@ class RigRemap:
         Raises:
             TypeError, ValueError: frames are missing, unknown, of other sizes or of unequal types.
         """
-        frames = self._listed(frames)
+        frames = in_order(frames, self.rig)
         gains = self.gains(frames) if self.gain else None
         if isinstance(frames[0], Tensor):
             return self._mixed([View.floating(self.view, f, torch.float32) for f in frames], gains)
         is_plain = frames[0].dtype == np.uint8 and frames[0].shape[2:] in ((), (1,), (3,))
         if is_plain and _module.LACK is None:
-            return self.sampler(gains=gains)(frames)
+            return (self._sampler if gains is None else self.sampler(gains=gains))(frames)
         kind = frames[0].dtype
         planes = [as_tensor(np.atleast_3d(f)).movedim(2, 0)[None] for f in frames]
         planes = [p if p.is_floating_point() else p.float() for p in planes]
@@ -151,15 +169,12 @@ class RigRemap:
             (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where the
             view shows nothing.
         """
-        targets, picture = self._listed(targets, dims=2), None
-        for number, target in enumerate(targets):
-            kind = target.dtype.newbyteorder("=")
-            if picture is None:
-                missing = IGNORE if kind == np.uint8 else 0
-                picture = np.full(self._count, missing, kind)
-            mine, (x, y) = self._nearest(number)
-            picture[mine] = target.astype(kind, copy=False)[y, x]
-        assert picture is not None
+        targets = in_order(targets, self.rig, maps=True)
+        kind = targets[0].dtype.newbyteorder("=")
+        picture = np.full(self._count, IGNORE if kind == np.uint8 else 0, kind)
+        for target, middles in zip(targets, self._middles, strict=True):
+            x, y = middles.nearest.T
+            picture[middles.mine] = target[y, x]
         return picture.reshape(self.view_size)
 
     def depth(
@@ -188,21 +203,22 @@ class RigRemap:
             check(name, repr(kind), kind in ("distance", "z"), "distance or z")
         if self.view.is_surface or self.rig.spread > _ONE_PLACE:
             raise ValueError("distances are those of a view if all cameras are at its place")
-        depths = self._listed(depths, dims=2)
+        depths = in_order(depths, self.rig, maps=True)
         distances = np.full(self._count, np.nan)
-        for number, (depth, remap) in enumerate(zip(depths, self.sources.values(), strict=True)):
-            mine, (x, y) = self._nearest(number)
-            points = self._seen.pixels[number, mine]
-            values = 1 / np.where(depth > 0, depth, np.nan).astype(np.float64)
-            columns, rows, right, lower = corners(points, remap.size)
-            four = np.stack([values[rows + k // 2, columns + k % 2] for k in range(4)])
-            with np.errstate(invalid="ignore"):
+        for depth, middles in zip(depths, self._middles, strict=True):
+            flat, width = np.ascontiguousarray(depth).ravel(), depth.shape[1]
+            columns, rows, right, lower = middles.corners
+            first = rows * width + columns
+            with np.errstate(divide="ignore", invalid="ignore"):
+                four = np.stack([flat[first + step] for step in (0, 1, width, width + 1)])
+                four = np.where(four > 0, 1 / four, np.nan)
                 one_surface = four.max(0) <= _ONE_SURFACE * four.min(0)
-            across = four[::2] * (1 - right) + four[1::2] * right
-            mixed = across[0] * (1 - lower) + across[1] * lower
-            cosine = remap.rays_of_image(points)[:, 2] if of == "z" else 1.0
-            with np.errstate(divide="ignore"):
-                distances[mine] = 1 / (np.where(one_surface, mixed, values[y, x]) * cosine)
+                across = four[::2] + (four[1::2] - four[::2]) * right
+                mixed = across[0] + (across[1] - across[0]) * lower
+                x, y = middles.nearest.T
+                nearest = flat[y * width + x]
+                far = np.where(one_surface, 1 / mixed, np.where(nearest > 0, nearest, np.nan))
+            distances[middles.mine] = far / middles.cosines if of == "z" else far
         if to == "z":
             axis = getattr(self.view, "direction", (0.0, 0.0, 1.0))
             rays = self.view.places(torch.from_numpy(self._grid)[None])[0].numpy()
@@ -219,9 +235,12 @@ class RigRemap:
             C) float32, from the frames of both.
         """
         values = []
-        for frame, pixels in zip(self._listed(frames), self._seen.pixels, strict=True):
-            planes = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None].float()
-            values.append(read_at(planes, np.nan_to_num(pixels))[0].T.numpy())
+        for frame, pixels in zip(in_order(frames, self.rig), self._seen.pixels, strict=True):
+            images = frame
+            if isinstance(frame, np.ndarray):
+                images = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None]
+            read = read_at(images.detach().float(), np.nan_to_num(pixels))
+            values.append(read.flatten(0, 1).T.cpu().numpy())
         shown = self._seen.room >= 0
         pairs = {}
         for a, b in itertools.combinations(range(len(values)), 2):
@@ -242,7 +261,7 @@ class RigRemap:
         rows, goals = [np.ones(len(names))], [0.0]
         for (a, b), (_, (first, second)) in self.overlaps(frames).items():
             inside = np.ones(first.shape[:1], bool)
-            if self._listed(frames)[0].dtype == np.uint8:
+            if in_order(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
                 both = np.concatenate((first, second), 1)
                 inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
             sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
@@ -278,7 +297,7 @@ class RigRemap:
         mean: PerChannel | None = None, std: PerChannel | None = None,
     ) -> "Sampler":  # fmt: skip
         """A `darswin.frames.Sampler` of the cameras' frames; arguments: see `plan`."""
-        from darswin.frames.plans import Sampler
+        from darswin.frames.sampler import Sampler
 
         return Sampler(self.plan(output, gains=gains, mean=mean, std=std))
 
@@ -341,48 +360,24 @@ class RigRemap:
         with torch.inference_mode(False), torch.no_grad():
             return reads_of(self.view, self.rig, self._seen, self.seam, self.distance)
 
-    def _nearest(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """The pixels of the view that a camera shows best, (K,), and its nearest pixels, (2, K)."""
-        room = self._seen.room
-        mine = np.flatnonzero((room.argmax(0) == number) & (room[number] >= 0))
-        points = self._seen.pixels[number, mine] + aside(self.view_size).reshape(-1, 2)[mine]
-        last = np.array(self.source(number).size[::-1]) - 1
-        return mine, np.rint(points.clip(0, last)).astype(np.intp).T
+    @cached_property
+    def _sampler(self) -> "Sampler":
+        return self.sampler()
 
-    def _listed(self, frames: Frames, dims: int | None = None) -> list[Any]:
-        """Frames of the cameras in their order; TypeError or ValueError for wrong ones."""
-        names = self.rig.names
-        if isinstance(frames, Mapping):
-            if {*frames} != {*names}:
-                wrong = sorted({*frames} ^ {*names}, key=str)
-                what = "is missing" if wrong[0] in names else f"is no camera of {', '.join(names)}"
-                raise ValueError(f"the frame {wrong[0]!r} {what}")
-            frames = [frames[name] for name in names]
-        if isinstance(frames, np.ndarray | Tensor) or len(frames) != len(names):
-            raise ValueError(
-                f"there must be a frame for each of {len(names)} cameras, got {len(frames)}"
-            )
-        kinds = {(type(f), getattr(f, "dtype", None), np.shape(f)[2:] if isinstance(f, np.ndarray)
-                  else np.shape(f)[:2]) for f in frames}  # fmt: skip
-        if len(kinds) > 1:
-            raise TypeError("all frames must have one type and one number of channels")
-        for name, frame in zip(names, frames, strict=True):
-            if not isinstance(frame, np.ndarray | Tensor):
-                raise TypeError(f"frame {name} must be an array or a tensor, got {type(frame)}")
-            shape, size = tuple(frame.shape), self.rig[name].size
-            tensor = isinstance(frame, Tensor)
-            if (shape[2:] if tensor else shape[:2]) != size or len(shape) > 3 + tensor:
-                raise ValueError(f"frame {name} must be of (H, W) = {size}, got shape {shape}")
-            if dims is not None and (tensor or len(shape) != dims):
-                raise ValueError(f"the map of {name} must be an array (H, W), got shape {shape}")
-            if (
-                dims is None
-                and not tensor
-                and np.dtype(frame.dtype).kind in "iu"
-                and frame.itemsize > 2
-            ):
-                raise TypeError(f"frames of {frame.dtype} would be mixed: remap.target moves ids")
-        return list(frames)
+    @cached_property
+    def _middles(self) -> list[Middles]:
+        """Where each camera shows the middles of pixels that it shows best."""
+        found = []
+        for number, (remap, points) in enumerate(
+            zip(self.sources.values(), self._seen.pixels, strict=True)
+        ):
+            room = self._seen.room
+            mine = np.flatnonzero((room.argmax(0) == number) & (room[number] >= 0))
+            nudged = points[mine] + aside(self.view_size).reshape(-1, 2)[mine]
+            nearest = np.rint(nudged.clip(0, np.array(remap.size[::-1]) - 1)).astype(np.intp)
+            cosines = remap.rays_of_image(points[mine])[:, 2]
+            found.append(Middles(mine, nearest, corners(points[mine], remap.size), cosines))
+        return found
 
     def _mixed(self, images: list[Tensor], gains: np.ndarray | None) -> Tensor:
         """The view of images (B, C, H, W) in floating point: (B, C, H', W')."""

@@ -1,5 +1,6 @@
 """Where a view of a rig reads the pictures of its cameras, and with which weights."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from darswin.lens.rig import Camera, Rig, is_in
 from darswin.views.base import Pair
 
 Seam = Literal["hard", "narrow", "wide"]
+Frames = Sequence[Any] | Mapping[str, Any]
 
 _APART, _MOST = 1.5, 16  # pixels of a picture between two points of a pixel, and points along it
 _NARROW = 0.04  # of the room of a camera, see `Seen`, half the width of a narrow seam
@@ -168,3 +170,37 @@ def read_at(image: Tensor, points: np.ndarray) -> Tensor:
         for row in (0, 1)
     )
     return torch.lerp(upper, under, lower)
+
+
+def in_order(frames: Frames, rig: Rig, maps: bool = False) -> list[Any]:
+    """Frames of the cameras of a rig in their order, or maps of labels or distances.
+
+    Raises:
+        TypeError: a frame is no array and no tensor, or they are of several types or channels.
+        ValueError: a frame is missing, unknown or of another size. Both errors name the camera.
+    """
+    if isinstance(frames, Mapping):
+        for name in {*frames} ^ {*rig.names}:
+            what = "is missing" if name in rig.names else f"is none of {', '.join(rig.names)}"
+            raise ValueError(f"the frame {name!r} {what}")
+        frames = [frames[name] for name in rig.names]
+    if isinstance(frames, np.ndarray | Tensor) or len(frames) != len(rig):
+        raise ValueError(f"there must be a frame for each of {len(rig)} cameras")
+    kinds = set()
+    for frame, (name, camera) in zip(frames, rig.cameras.items(), strict=True):
+        if not isinstance(frame, np.ndarray) and (maps or not isinstance(frame, Tensor)):
+            kind = "an array" if maps else "an array or a tensor"
+            raise TypeError(f"the frame of {name} must be {kind}, got {type(frame).__name__}")
+        is_array, shape, dtype = isinstance(frame, np.ndarray), tuple(frame.shape), frame.dtype
+        size, channels = (shape[:2], shape[2:]) if is_array else (shape[2:], shape[:2])
+        if size != camera.size or len(shape) > (4 - is_array if not maps else 2):
+            form = "(H, W)" if maps else "(H, W) or (H, W, C)" if is_array else "(B, C, H, W)"
+            raise ValueError(
+                f"the frame of {name} must be {form} with (H, W) = {camera.size}, got {shape}"
+            )
+        if isinstance(dtype, np.dtype) and not maps and dtype.kind in "iu" and dtype.itemsize > 2:
+            raise TypeError(f"frames of {dtype} would be mixed: remap.target moves ids")
+        kinds.add((is_array, dtype, channels))
+    if len(kinds) > 1:
+        raise TypeError(f"all frames must have one type and one number of channels, got {kinds}")
+    return list(frames)
