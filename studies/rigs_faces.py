@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from rigs_peers import Careful, Panorama, Table, Usual
+from rigs_peers import Careful, Panorama, Table, Usual, read
 from rigs_scene import AHEAD, NOTHING, Picture, Scene, picture, rays_of, room
 
 from darswin import Rig
@@ -138,11 +138,6 @@ def parts_of(lens: Lens, size: tuple[int, int]) -> dict[str, np.ndarray]:
     return dict(all=seen, rim=seen & (theta > RIM), seams=seen & (blocks.max((1, 3)) > low))
 
 
-def one_read(faces: list[np.ndarray], table: Table, how: int) -> np.ndarray:
-    reader = Usual.__new__(Usual)
-    return reader._read(faces, table, how, 0)
-
-
 # -- the study --------------------------------------------------------------------------------
 
 
@@ -167,16 +162,16 @@ def study(out: Path, sides: tuple[int, ...] = SIDES, size: tuple[int, int] = SIZ
             frames = [as_frame(of.colour) for of in seen]
             rows.append(dict(
                 side=side, engine=samples, ours=scores(remap(frames)),
-                nearest=scores(one_read(frames, table, cv2.INTER_NEAREST)),
-                bilinear=scores(one_read(frames, table, cv2.INTER_LINEAR)),
+                nearest=scores(read(frames, table, cv2.INTER_NEAREST)),
+                bilinear=scores(read(frames, table, cv2.INTER_LINEAR)),
                 reads=len(remap.reads.pixels) / where["all"].sum(),
             ))  # fmt: skip
         labels = remap.target([of.label for of in seen])
-        distance = remap.depth([of.distance for of in seen], to="distance")
-        read = [of.distance for of in seen]
+        depths = [of.distance for of in seen]
+        distance = remap.depth(depths, to="distance")
         rows[-1] |= dict(
             labels=label_scores(labels, true), distances=distance_scores(distance, true),
-            bilinear_distances=distance_scores(_interpolated(read, table), true),
+            bilinear_distances=distance_scores(_interpolated(depths, table), true),
         )  # fmt: skip
     return dict(
         size=size, truth=TRUTH, fov=math.degrees(FOV), rows=rows, pixels={
@@ -190,7 +185,7 @@ def _interpolated(faces: list[np.ndarray], table: Table) -> np.ndarray:
     side = table.side
     middle = (np.arange(side) + 0.5) / side * 2 - 1
     length = np.sqrt(1 + middle**2 + middle[:, None] ** 2).astype(np.float32)
-    found = one_read([z * length for z in faces], table, cv2.INTER_LINEAR)
+    found = read([z * length for z in faces], table, cv2.INTER_LINEAR)
     return np.where(table.seen, found, np.nan)
 
 
@@ -227,16 +222,13 @@ def speed(out: Path, frames: int = FRAMES, size: tuple[int, int] = TIMED) -> dic
         "cv2, six remaps, 3 × 3": lambda: Usual(rays, size, SIDE, 3),
         "py360convert, 2 × 2": lambda: Panorama(rays, size, SIDE, 2),
     }
-    made, starts = {}, {}
+    made, results = {}, {}
     for way, make in ways.items():
         start = time.perf_counter()
-        made[way] = make()
-        starts[way] = time.perf_counter() - start
-    results = {}
-    for way, of in made.items():
+        of = made[way] = make()
         image, labels, distance = (getattr(of, kind)(faces[kind]) for kind in KINDS)
         results[way] = dict(
-            start=starts[way], psnr=psnr(image, true.colour, true.label != NOTHING),
+            first=time.perf_counter() - start, psnr=psnr(image, true.colour, true.label != NOTHING),
             labels=label_scores(labels, true), distances=distance_scores(distance, true),
             times={},
         )  # fmt: skip

@@ -35,53 +35,48 @@ class Table:
             self.place[of] = np.stack((right, down), 1) / forward[:, None]
         self.place = ((self.place + 1) * side - 1) / 2
         self.place[self.seen] = self.place[self.seen].clip(0, side - 1)
+        self.maps = self.place.astype(np.float32)
+        self.masks = [(self.face == number).astype(np.uint8) for number in range(len(ORDER))]
+        share = self.seen.astype(np.float32)
+        share = cv2.resize(share, size[::-1], interpolation=cv2.INTER_AREA)[..., None]
+        self.whole = np.divide(1, share, out=np.zeros_like(share), where=share > 0)
 
     def mean(self, fine: np.ndarray) -> np.ndarray:
         """The mean of the points of each pixel that the lens sees."""
         if self.samples == 1:
             return fine
-        width = self.size[::-1]
-        if self.seen.all():
-            return cv2.resize(fine, width, interpolation=cv2.INTER_AREA)
-        total = cv2.resize(fine, width, interpolation=cv2.INTER_AREA).astype(np.float32)
-        return np.rint(total * self.rest).astype(fine.dtype)
+        total = cv2.resize(fine, self.size[::-1], interpolation=cv2.INTER_AREA)
+        return total if self.seen.all() else np.rint(total * self.whole).astype(fine.dtype)
 
-    @property
-    def rest(self) -> np.ndarray:
-        if not hasattr(self, "_rest"):
-            share = cv2.resize(
-                self.seen.astype(np.float32), self.size[::-1], interpolation=cv2.INTER_AREA
-            )
-            self._rest = (1 / np.maximum(share, 1e-6))[..., None]
-            self._rest[share == 0] = 0
-        return self._rest
+
+def read(
+    faces: Sequence[np.ndarray], table: Table, how: int, missing: float = 0,
+    maps: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """What the points of a table show; `missing` beyond the lens."""
+    picture = np.full((*table.face.shape, *faces[0].shape[2:]), missing, faces[0].dtype)
+    maps = table.maps if maps is None else maps
+    for face, mask in zip(faces, table.masks, strict=True):
+        cv2.copyTo(cv2.remap(face, maps, None, how, None, cv2.BORDER_REPLICATE), mask, picture)
+    return picture
 
 
 class Usual:
-    """One cv2.remap of the whole picture for each face, and its mask."""
+    """For each face one cv2.remap of the whole picture, of which a mask is copied."""
 
     def __init__(self, rays: Rays, size: tuple[int, int], side: int, samples: int):
         self.fine, self.one = Table(rays, size, side, samples), Table(rays, size, side)
-        self.cosine = np.full(size, np.nan)
+        self.corner = np.floor(self.one.place).astype(np.float32)
+        self.cosine = np.full(size, np.nan, np.float32)
         for number, name in enumerate(ORDER):
             of = self.one.face == number
             self.cosine[of] = self.one.rays[of] @ AXES[name][2]
 
-    def _read(self, faces: Sequence[np.ndarray], table: Table, how: int, missing: float):
-        shape = table.face.shape
-        picture = np.full((*shape, *faces[0].shape[2:]), missing, faces[0].dtype)
-        x, y = np.moveaxis(table.place.astype(np.float32), -1, 0)
-        for number, face in enumerate(faces):
-            of = table.face == number
-            read = cv2.remap(face, x, y, how, borderMode=cv2.BORDER_REPLICATE)
-            picture[of] = read[of]
-        return picture
-
     def colour(self, faces: Sequence[np.ndarray]) -> np.ndarray:
-        return self.fine.mean(self._read(faces, self.fine, cv2.INTER_LINEAR, 0))
+        return self.fine.mean(read(faces, self.fine, cv2.INTER_LINEAR))
 
     def label(self, faces: Sequence[np.ndarray]) -> np.ndarray:
-        return self._read(faces, self.one, cv2.INTER_NEAREST, NOTHING)
+        return read(faces, self.one, cv2.INTER_NEAREST, NOTHING)
 
     def distance(self, faces: Sequence[np.ndarray]) -> np.ndarray:
         """1/z of one surface is interpolated, of several the nearest counts."""
@@ -89,12 +84,10 @@ class Usual:
         square = np.ones((2, 2), np.uint8)
         most = [cv2.dilate(of, square, anchor=(0, 0)) for of in inverse]
         least = [cv2.erode(of, square, anchor=(0, 0)) for of in inverse]
-        corner = Table.__new__(Table)
-        corner.__dict__.update(self.one.__dict__)
-        corner.place = np.floor(self.one.place)
-        high, low = (self._read(of, corner, cv2.INTER_NEAREST, np.nan) for of in (most, least))
-        mixed = self._read(inverse, self.one, cv2.INTER_LINEAR, np.nan)
-        nearest = self._read(inverse, self.one, cv2.INTER_NEAREST, np.nan)
+        high = read(most, self.one, cv2.INTER_NEAREST, np.nan, self.corner)
+        low = read(least, self.one, cv2.INTER_NEAREST, np.nan, self.corner)
+        mixed = read(inverse, self.one, cv2.INTER_LINEAR, np.nan)
+        nearest = read(inverse, self.one, cv2.INTER_NEAREST, np.nan)
         return 1 / (np.where(high < 1.1 * low, mixed, nearest) * self.cosine)
 
 
