@@ -311,6 +311,7 @@ class RigRemap:
             output, mean, std: see `Remap.plan`.
             gains: (n,), a factor for each camera, such as those of `gains`.
         """
+        from darswin.frames.plan_files import check_size
         from darswin.frames.rig_plans import RigPlan  # the compiled module
 
         mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
@@ -319,7 +320,7 @@ class RigRemap:
         if mean is None or std is None:
             raise ValueError("frames are normalized: give the mean and the std of the network")
         channels = max(np.size(mean), np.size(std))
-        reads, sizes = self.reads, [camera.size for camera in self.rig.cameras.values()]
+        sizes, reads = [check_size(c.size) for c in self.rig.cameras.values()], self.reads
         factors = np.asarray(np.ones(len(sizes)) if gains is None else gains, np.float32)
         columns, rows, right, lower = corners(reads.points, np.array(sizes)[reads.sources].T)
         return RigPlan(
