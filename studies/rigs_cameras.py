@@ -84,9 +84,10 @@ def two_lenses(out: Path) -> dict:
         ]
         seams = {seam: view.at(rig, seam=seam, **options) for seam in SEAMS}
         wide = seams["wide"]
-        return dict(
+        found = {} if options else dict(apart=np.abs(alone[0] - alone[1])[line].mean())
+        return found | dict(
             seams={seam: scores(remap(frames)) for seam, remap in seams.items()},
-            apart=np.abs(alone[0] - alone[1])[line].mean(), gains=wide.gains(frames).tolist(),
+            gains=wide.gains(frames).tolist(),
             disagreement=wide.disagreement(frames)[0]["front", "back"],
         )  # fmt: skip
 

@@ -4,6 +4,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -220,8 +221,9 @@ def speed(out: Path, frames: int = FRAMES, size: tuple[int, int] = TIMED) -> dic
         "cv2, one remap, 3 × 3": lambda: Careful(rays, size, SIDE, 3),
         "cv2, six remaps, 2 × 2": lambda: Usual(rays, size, SIDE, 2),
         "cv2, six remaps, 3 × 3": lambda: Usual(rays, size, SIDE, 3),
-        "py360convert, 2 × 2": lambda: Panorama(rays, size, SIDE, 2),
     }
+    if find_spec("py360convert"):
+        ways["py360convert, 2 × 2"] = lambda: Panorama(rays, size, SIDE, 2)
     made, results = {}, {}
     for way, make in ways.items():
         start = time.perf_counter()
@@ -235,15 +237,14 @@ def speed(out: Path, frames: int = FRAMES, size: tuple[int, int] = TIMED) -> dic
     for threads in (1, 2):
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
-        times = {way: {kind: [] for kind in KINDS} for way in made}
+        times: dict = {way: {kind: [] for kind in KINDS} for way in made}
         for _ in range(frames):
             for way, of in made.items():
                 for kind in KINDS:
                     start = time.perf_counter()
                     getattr(of, kind)(faces[kind])
                     times[way][kind].append(time.perf_counter() - start)
-        for way in made:
-            results[way]["times"][str(threads)] = {
-                kind: statistics.median(times[way][kind]) for kind in KINDS
-            } | dict(all=sum(map(sum, times[way].values())))
+        for way, of in times.items():
+            medians = {kind: statistics.median(of[kind]) for kind in KINDS}
+            results[way]["times"][str(threads)] = medians | dict(all=sum(map(sum, of.values())))
     return dict(size=size, side=SIDE, frames=frames, ways=results)
