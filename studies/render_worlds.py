@@ -23,7 +23,7 @@ from worlds.sheet import draw_sheet
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, help="out/worlds, or out/cubes with --cube, if not given")
+    parser.add_argument("--out", type=Path, help="the default is out/worlds, or out/cubes")
     parser.add_argument(
         "--lens",
         default="0..1",

@@ -1,4 +1,4 @@
-"""The study of rigs: faces of a simulator, two lenses and a car, against pictures rendered directly.
+"""The study of rigs: faces of a simulator, two lenses and a car, against exact pictures.
 
 The scenes are analytic, so the truth has 16 × 16 exact rays a pixel. Pictures are rendered once and
 kept in `out/rigs`. `pip install py360convert==1.0.4` adds that peer. `make study-rigs`.
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import rigs_cameras
 import rigs_faces
+import rigs_sheet
 from jobs import use_one_core
 from rigs_tables import publish
 
@@ -29,6 +30,7 @@ def main(arguments: list[str] | None = None) -> None:
             faces=rigs_faces.study(args.out), two=rigs_cameras.two_lenses(args.out),
             car=rigs_cameras.four_cameras(args.out),
         )  # fmt: skip
+        rigs_sheet.draw(args.out, args.results / "rigs.png")
     publish(record | dict(speed=rigs_faces.speed(args.out)), args.results)
 
 

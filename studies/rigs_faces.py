@@ -1,4 +1,4 @@
-"""A fisheye picture from the six faces of a simulator, against the same picture rendered directly."""
+"""A fisheye picture from the six faces of a simulator, against direct rendering."""
 
 import math
 import statistics
@@ -25,9 +25,7 @@ PHANTOM = 0.01  # of the distance
 TIMED, FRAMES, SIDE = (480, 640), 30, 512
 
 
-def fisheye(
-    size: tuple[int, int], radius: float, fov: float = FOV, *, curved: bool = True
-) -> Lens:
+def fisheye(size: tuple[int, int], radius: float, fov: float = FOV, *, curved: bool = True) -> Lens:
     """A Kannala–Brandt lens whose field of view fills a circle around the picture's middle, or an
     equidistant one."""
     radial = [[-0.035, 0.001, 0, 0]] if curved else [[0.0] * 4]
@@ -117,7 +115,7 @@ def distance_scores(found: np.ndarray, true: Picture) -> dict:
     within a pixel."""
     seen, off_edges = true.label != NOTHING, plain(true)
     off = np.abs(found / true.distance - 1)
-    suspects = np.argwhere(seen & ~(off <= PHANTOM))
+    suspects = np.argwhere(seen & (off > PHANTOM))
     every = np.pad(true.distances, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
     phantoms = 0
     for y, x in suspects:
@@ -195,7 +193,10 @@ class Ours:
 
     def __init__(self, lens: Lens, size: tuple[int, int], side: int):
         self.remap = CameraView(lens, size).at(Rig.cube(side))
-        self.colour, self.label = self.remap, self.remap.target
+        self.sampler, self.label = self.remap.sampler(), self.remap.target
+
+    def colour(self, faces: list[np.ndarray]) -> np.ndarray:
+        return self.sampler(faces, threads=cv2.getNumThreads())
 
     def distance(self, faces: list[np.ndarray]) -> np.ndarray:
         return self.remap.depth(faces, to="distance")

@@ -59,6 +59,8 @@ def write_face(view: View, folder: Path, file: str) -> None:
     z = view.distance / np.sqrt(1 + middle**2 + middle[:, None] ** 2)
     steps = np.round(z * DEPTH_UNIT)
     depth = np.where(steps < 2**16, steps, 0).astype(np.uint16)
-    for kind, picture in dict(colour=view.image[..., ::-1], labels=view.labels, depth=depth).items():
+    for kind, picture in dict(
+        colour=view.image[..., ::-1], labels=view.labels, depth=depth
+    ).items():
         _, data = cv2.imencode(".png", picture)
         (folder / kind / file).write_bytes(data)
