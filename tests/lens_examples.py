@@ -40,6 +40,16 @@ def double(*values):
     return torch.tensor(values, dtype=f64)
 
 
+def poses(seed: int, count: int) -> list[np.ndarray]:
+    """Random poses (4, 4) of cameras in a rig."""
+    rng = np.random.default_rng(seed)
+    found = np.tile(np.eye(4), (count, 1, 1))
+    turns = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    found[:, :3, :3] = turns * np.linalg.det(turns)[:, None, None]
+    found[:, :3, 3] = rng.normal(size=(count, 3))
+    return list(found)
+
+
 # A camera of 1280 × 960 px, and its calibration in the forms of other tools.
 K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
 FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]

@@ -27,11 +27,19 @@ _TEXTS = {
     "partition ends. The default is the largest angle that the images show.",
     "fov_deg": "the horizontal field of view of a view between the outer edges of a row, in "
     "degrees. The default is all that the lens sees.",
-    "up": "the direction away from gravity, for views, as x right, y down and z forward of the "
-    "camera. The default is the top of the picture, 0,-1,0.",
+    "up": "the direction away from gravity. For views: as x right, y down and z forward of the "
+    "camera; the default is the top of the picture, 0,-1,0. For rigs: in the frame of their file; "
+    "the default is what the file says.",
     "every": "the step between the frames of a video that are predicted; 1 predicts all.",
     "rings": "the number of rings of the partition.",
     "sectors": "the number of sectors of the partition.",
+    "rig": "the file or the folder of a rig, in any format that darswin.Rig.load reads; or "
+    "cube:SIDE for the six pictures of a simulator, with their side in px.",
+    "height": "the height of the origin of the rig's file above the ground, in metres.",
+    "direction": "where the poses of a file lead that does not say so.",
+    "span": "the width of the ground that is shown, in metres. The default is 12.",
+    "distance": "of what the cameras see, in metres, if they are at different places and the "
+    "ground is not shown. The default is far away.",
 }
 # Nobody names a folder so, but for a mistake.
 _OF_FILES = {".csv", ".jpeg", ".jpg", ".json", ".mp4", ".onnx", ".png", ".safetensors", ".txt",

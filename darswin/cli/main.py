@@ -64,6 +64,11 @@ COMMANDS = {
         PICTURES,
         "darswin.cli.lens:COMMANDS",
     ),
+    "rig": Command(
+        "draws, stitches and checks several cameras, or makes fisheye pictures of a cube's faces",
+        PICTURES,
+        "darswin.cli.rig:COMMANDS",
+    ),
     "warp": Command(
         "writes pictures and labels as another lens or a view sees them",
         PICTURES,

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from darswin.lens import BrownConrady, Lens, Perspective
-from darswin.lens.files.load import reach
+from darswin.lens.files.load import Calibration, reach
 from darswin.utils.nearest import did_you_mean
 from darswin.utils.parameters import check, naming
-from darswin.views import PixelView, list_views, make_view, turned
+from darswin.views import CameraView, PixelView, list_views, make_view, turned
 from darswin.views.registry import flat_views, view_class
 
 Up = tuple[float, float, float]
@@ -62,13 +62,13 @@ class Look(NamedTuple):
         shape = max(1, round(side * aspect / longer)), max(1, round(side / longer))
         return math.degrees(fov) if self.fov_deg is None else self.fov_deg, shape
 
-    def make(self, size: tuple[int, int], fov_deg: float) -> PixelView:
+    def make(self, size: tuple[int, int], fov_deg: float | None) -> PixelView:
         """The view of (H, W)."""
         turn: dict[str, Any] = {}
         if self._turns:
             turn = turned(math.radians(self.yaw_deg), math.radians(self.pitch_deg))
             turn |= {} if self.up is None else dict(up=self.up)
-        fov = None if self._around else math.radians(fov_deg)
+        fov = None if self._around or fov_deg is None else math.radians(fov_deg)
         view = make_view(self.view, size, fov=fov, **turn)
         assert isinstance(view, PixelView)
         return view
@@ -100,6 +100,15 @@ def to_corners(lens: Lens) -> Lens:
     corners = [[x, y] for x in (-0.5, width) for y in (-0.5, height)]
     theta = whole.theta_and_direction(lens.theta_max.new_tensor([corners]))[0]
     return lens.with_theta_max(theta.nan_to_num(whole.theta_max.item()).max().item())
+
+
+def camera_view(to: str, size: tuple[int, int] | None) -> CameraView:
+    """The pictures of (H, W) of a camera, from its calibration file or its lens as JSON."""
+    calibration = Calibration(to, "--to") if to.startswith("{") else Calibration.read(to)
+    lens = calibration.lens(image_size=size)
+    if lens.image_size is None:
+        raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
+    return CameraView(to_corners(lens if size is None else lens.in_picture(size)))
 
 
 def named_view(

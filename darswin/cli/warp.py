@@ -19,14 +19,13 @@ import torch
 
 from darswin.boxes import Instances
 from darswin.cli.pictures import ByLens, claim_folder, is_below
-from darswin.cli.views import named_view, to_corners
+from darswin.cli.views import camera_view, named_view, to_corners
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.labels import Labels, open_labels, write_coco, write_yolo
 from darswin.data.labels.labels import LEAST_VISIBLE, LabelledPictures, move_instances
 from darswin.data.labels.yolo import is_yolo, moved_splits
 from darswin.lens import Lens, save, to_dict
 from darswin.lens.files.fields import listed
-from darswin.lens.files.load import Calibration
 from darswin.lens.files.reader import Coefficients
 from darswin.utils.files import replace_file
 from darswin.utils.image import (
@@ -247,11 +246,7 @@ def _view(
     if not is_json(to) and not os.path.exists(to):
         text = f"`to` {to} is neither a file nor a view: {', '.join(list_views())}"
         raise naming(FileNotFoundError(text), "to")
-    calibration = Calibration(to, "--to") if is_json(to) else Calibration.read(to)
-    lens = calibration.lens(image_size=size)
-    if lens.image_size is None:
-        raise naming(ValueError(f"{to} has no image_size: give `size`"), "size")
-    return CameraView(to_corners(lens if size is None else lens.in_picture(size)))
+    return camera_view(to, size)
 
 
 def _write(

@@ -21,7 +21,6 @@ A graph that `export_onnx(..., input="tokens")` wrote takes the tokens, with a b
 
 from darswin.frames.network import Network
 from darswin.frames.plans import Plan
-from darswin.frames.rig_plans import RigPlan
 from darswin.frames.sampler import Sampler
 
-__all__ = ["Network", "Plan", "RigPlan", "Sampler"]
+__all__ = ["Network", "Plan", "Sampler"]

@@ -1,7 +1,6 @@
 """Plans of several cameras: where their frames are read for one picture."""
 
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -85,31 +84,3 @@ class RigPlan(PlanFile):
     @classmethod
     def of_file(cls, parts: dict[str, Any], texts: dict[str, str]) -> Self:
         return cls(**parts | dict(names=json.loads(texts["names"])))
-
-    def in_order(self, frames: Sequence[Any] | Mapping[str, Any]) -> tuple[Any, ...]:
-        """Frames in the order of the names.
-
-        Raises:
-            TypeError: the frames are no list and no mapping.
-            ValueError: they are more or fewer than the cameras, or a name is missing or unknown.
-        """
-        if isinstance(frames, Mapping):
-            known = ", ".join(self.names)
-            for name in self.names:
-                if name not in frames:
-                    raise ValueError(f"there is no frame of the camera {name} among the frames")
-            for name in frames:
-                if name not in self.names:
-                    raise ValueError(f"the plan has no camera {name}, only {known}")
-            return tuple(frames[name] for name in self.names)
-        if not isinstance(frames, Sequence):
-            raise TypeError(
-                "frames must be a list in the order of the plan's cameras, or a mapping from their "
-                f"names, got {type(frames).__name__}"
-            )
-        if len(frames) != len(self.names):
-            raise ValueError(
-                f"the plan needs {len(self.names)} frames, those of {', '.join(self.names)}, got "
-                f"{len(frames)}"
-            )
-        return tuple(frames)

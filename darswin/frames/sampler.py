@@ -10,6 +10,7 @@ from darswin.frames.compiled import frames
 from darswin.frames.plan_files import read_plan
 from darswin.frames.plans import Plan
 from darswin.frames.rig_plans import RigPlan
+from darswin.utils.named import in_order
 
 
 class Sampler:
@@ -65,5 +66,5 @@ class Sampler:
         threads: int = 1,
     ) -> np.ndarray:
         if isinstance(self.plan, RigPlan):
-            frame = self.plan.in_order(frame)
+            frame = in_order(frame, self.plan.names)
         return self._sample(frame, out, threads)

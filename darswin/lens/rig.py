@@ -1,15 +1,20 @@
 """Several cameras that are fixed to each other: on a car, back to back, or the faces of a cube."""
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 
 from darswin.lens.base import Lens
+from darswin.lens.files import rigs
 from darswin.lens.ideal import Perspective
+from darswin.lens.image import Size
 from darswin.utils.angles import unit_vector
+from darswin.utils.parameters import naming
+from darswin.utils.poses import to_pose
 
 Vector = tuple[float, float, float]
 
@@ -128,6 +133,65 @@ class Rig:
         """
         return cls({"camera": (lens, size, np.eye(4))}, up=up, forward=ahead_of(up)).raised(height)
 
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike | Iterable[str | os.PathLike], *, up: Any = None,
+        forward: Any = None, height: float = 0.0, direction: str | None = None,
+        cameras: str | os.PathLike | None = None, coefficients: str | None = None,
+        image_size: Size = None,
+    ) -> Self:  # fmt: skip
+        """Reads the cameras and their poses.
+
+        The files are our own JSON, Kalibr's camchain, that of OpenCV's calibrateMultiview,
+        WoodScape's, COLMAP's rig_config.json, KITTI-360's folder, and any camera that `load` reads
+        with its matrix beside it. The page "Files of rigs" says what the numbers of each mean.
+
+        Args:
+            path: a file, several files of one camera each, or a folder of them.
+            up: away from gravity in the rig's frame; None means what the file says, and else the
+                top of the picture of the camera in whose frame the poses are.
+            forward: see `Rig`; None means what the file says, and else `up` tells.
+            height: of the origin of the file's frame above the ground, m: see `raised`.
+            direction: "camera_to_rig" or "rig_to_camera", where the poses of a file lead that does
+                not say so.
+            cameras: the cameras.txt or cameras.bin of a COLMAP rig_config.json without lenses.
+            coefficients: see `load`.
+            image_size: (H, W) px, used if the file has no image size.
+
+        Raises:
+            ValueError: an unknown format, a missing or wrong entry, no poses, a pose that holds no
+                rotation, two cameras of one name, or an option that is missing. The message names
+                the file and the camera.
+            OSError: a file cannot be opened.
+        """
+        with rigs.about(path):
+            found = rigs.Reader(direction, cameras, coefficients, image_size).read(path)
+            up = found.up if up is None else up
+            if up is None and not found.in_camera:
+                text = "the file does not say which way is up in its frame: give `up`"
+                raise naming(ValueError(text), "up")
+            up = (0.0, -1.0, 0.0) if up is None else up
+            forward = found.forward if forward is None else forward
+            if forward is None and found.in_camera:
+                forward = ahead_of(up)
+            return cls(found.cameras, up=up, forward=forward).raised(height)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes a file that `load` reads.
+
+        Our own JSON (.json) holds all of a rig. Kalibr's camchain (.yaml, .yml) calls the cameras
+        cam0, cam1, …, and has their poses in the frame of the first one; what is up and θ_max are
+        lost.
+
+        Warns:
+            UserWarning: a lens sees more than Kalibr knows: see `darswin.lens.save`.
+
+        Raises:
+            ValueError: another ending, or a lens that the file cannot hold exactly.
+        """
+        with rigs.about(path):
+            rigs.write(path, self.cameras, self.up, self.forward)
+
     def raised(self, height: float) -> Self:
         """The same rig with its origin lower by a height, m: on the ground, on which `GroundView`
         needs it, if that is the height of the origin above it."""
@@ -153,7 +217,7 @@ class Rig:
 
     @property
     def level(self) -> np.ndarray:
-        """The rotation (3, 3) to the rig's frame from its level one: x right, y down, z ahead."""
+        """The rotation (3, 3) to the rig's frame from its level one, x right, y down, z ahead."""
         down = -np.array(self.up)
         right = np.cross(down, self.forward)
         right /= np.linalg.norm(right)
@@ -179,22 +243,16 @@ class Rig:
         Returns:
             Pixels (n, ..., 2), NaN beyond θ_max; and whether a picture shows the point, (n, ...).
         """
-        cameras, points = self.cameras.values(), np.asarray(points, np.float64)
-        pixels = [seen_by(camera, points, 1.0) for camera in cameras]
-        shown = [is_in(at, camera.size) for at, camera in zip(pixels, cameras, strict=True)]
+        points, pixels, shown = np.asarray(points, np.float64), [], []
+        for lens, size, pose in self.cameras.values():
+            local = torch.from_numpy((points - pose[:3, 3]) @ pose[:3, :3])
+            pixels.append(lens.project_points(local[None], size)[0].numpy())
+            shown.append(is_in(pixels[-1], size))
         return np.stack(pixels), np.stack(shown)
 
     def __repr__(self) -> str:
         cameras = (f"{name}: {c.lens}, {c.size}" for name, c in self.cameras.items())
         return f"Rig({'; '.join(cameras)}; up={self.up}, forward={self.forward})"
-
-
-def seen_by(camera: Camera, points: np.ndarray, weight: float) -> np.ndarray:
-    """The pixels (..., 2) of a camera at which points of the rig's frame are seen; with a weight of
-    0, the points are directions."""
-    inverse = np.linalg.inv(camera.pose)
-    local = points @ inverse[:3, :3].T + weight * inverse[:3, 3]
-    return camera.lens.project_points(torch.from_numpy(local)[None], camera.size)[0].numpy()
 
 
 def is_in(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -224,16 +282,9 @@ def _camera(what: str, lens: Any, size: Any, pose: Any) -> Camera:
                 f"{what}: its lens belongs to pictures of (H, W) = {(height, width)}, got {size}"
             )
         size = height, width
-    if size is None or len(size) != 2 or min(size) < 2:
+    if size is None:
+        raise ValueError(f"{what}: neither the lens nor image_size has a size of its pictures")
+    if len(size) != 2 or min(size) < 2:
         raise ValueError(f"{what}: its pictures must have a size of at least 2 × 2 px, got {size}")
-    matrix = np.eye(4)
-    values = np.asarray(pose, np.float64)
-    if values.shape not in ((3, 4), (4, 4)) or not np.isfinite(values).all():
-        raise ValueError(f"{what}: a pose is (3, 4) or (4, 4) finite numbers, got {pose}")
-    matrix[: len(values)] = values
-    rotation = matrix[:3, :3]
-    turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    if not turns or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise ValueError(f"{what}: its pose holds no rotation, got {values.tolist()}")
     exact = lens.detach().to("cpu", torch.float64)
-    return Camera(exact, (int(size[0]), int(size[1])), matrix)
+    return Camera(exact, (int(size[0]), int(size[1])), to_pose(what, pose))

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Self, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -306,3 +307,20 @@ def check_count(lenses: int, images: Tensor) -> None:
         raise ValueError(
             f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
         )
+
+
+def form_of_frames(
+    view: Any, output: str, mean: PerChannel | None, std: PerChannel | None
+) -> dict[str, Any]:
+    """The output of a plan, and its mean and std for each channel: those of a view if None."""
+    from darswin.frames.plan_files import check_output
+
+    check_output(output)
+    mean, std = view.mean if mean is None else mean, view.std if std is None else std
+    if output == "uint8":
+        mean, std = 0.0, 1.0
+    if mean is None or std is None:
+        raise ValueError("frames are normalized: give the mean and the std of the network")
+    channels = max(np.size(mean), np.size(std))
+    each = {name: per_channel(name, v, channels) for name, v in (("mean", mean), ("std", std))}
+    return {"output": output, **each}

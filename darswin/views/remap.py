@@ -12,16 +12,15 @@ from darswin.boxes import Instances
 from darswin.boxes.arrays import PointMap, table_of
 from darswin.lens import Lens
 from darswin.ops import _module
-from darswin.ops.checks import check_pair, per_channel, tensor_there
+from darswin.ops.checks import check_pair, tensor_there
 from darswin.utils.arrays import as_tensor
 from darswin.utils.tasks import IGNORE
-from darswin.views.base import Pair, PerChannel, check_images, check_lens
+from darswin.views.base import Pair, PerChannel, check_images, check_lens, form_of_frames
 from darswin.views.floor import on_floor
 from darswin.views.orientation import Vector
 
 if TYPE_CHECKING:
-    from darswin.frames.plans import Plan
-    from darswin.frames.sampler import Sampler
+    from darswin.frames import Plan, Sampler
 
 Points = TypeVar("Points", np.ndarray, Tensor)
 Value = TypeVar("Value")
@@ -277,22 +276,15 @@ class Remap:
             output: "uint8" or "image", see `Plan`.
             mean, std: the normalization of "image"; the default is the view's.
         """
-        from darswin.frames.plan_files import check_output, check_size  # the compiled module
+        from darswin.frames.plan_files import check_size  # the compiled module
         from darswin.frames.plans import Plan
 
-        check_output(output)
         check_size(self.size)
-        mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
-        if output == "uint8":
-            mean, std = 0.0, 1.0
-        if mean is None or std is None:
-            raise ValueError("frames are normalized: give the mean and the std of the network")
-        channels = max(np.size(mean), np.size(std))
+        form = form_of_frames(self.view, output, mean, std)
+        supersampling = self.points.shape[1] // self.view_size[1]
         return Plan.of_points(
-            self.points, self.size, output=output, mean=per_channel("mean", mean, channels),
-            std=per_channel("std", std, channels), tiles=self.view.count,
-            supersampling=self.points.shape[1] // self.view_size[1],
-        )  # fmt: skip
+            self.points, self.size, **form, tiles=self.view.count, supersampling=supersampling
+        )
 
     @_kept
     def points(self) -> np.ndarray:

@@ -12,31 +12,31 @@ from torch import Tensor
 
 from darswin.lens.rig import Rig
 from darswin.ops import _module
-from darswin.ops.checks import per_channel
 from darswin.utils.arrays import as_tensor
 from darswin.utils.parameters import check
 from darswin.utils.tasks import IGNORE
-from darswin.views.base import Pair, PerChannel, View
+from darswin.views.base import Pair, PerChannel, View, form_of_frames
 from darswin.views.remap import Remap, aside
 from darswin.views.rig_reads import (
     Frames,
     Reads,
     Seam,
     Seen,
+    checked,
     corners,
     grid,
-    in_order,
     read_at,
     reads_of,
     see,
 )
 
 if TYPE_CHECKING:
+    from darswin.frames import Sampler
     from darswin.frames.rig_plans import RigPlan
-    from darswin.frames.sampler import Sampler
 
 _ONE_SURFACE = 1.1  # the largest ratio of depths of neighbours on one surface
 _ONE_PLACE = 1e-6  # m
+_RIM = 0.02  # of the room of a camera: at the rim, pixels mix with what is beyond
 _GREY = (4, 251)  # of 8 bits: what is darker or lighter says nothing about gains
 
 
@@ -63,7 +63,7 @@ class RigRemap:
         view: a `GroundView`, a `CameraView`, or a view of rays, in the rig's level frame: x right,
             y down, z ahead. Without `fov`, a view of rays shows as much as its kind usually has.
         seam: "hard" reads each point from one camera; "narrow" mixes two in the middle of their
-            overlap, and "wide" in all of it.
+            overlap, and "wide" all cameras that see it.
         gain: whether each camera gets one factor, from where the frames overlap; see `gains`.
         distance: m, of what the view shows from the middle of the rig. None is infinity: right if
             the cameras are at one place. A `GroundView` has its own.
@@ -128,6 +128,11 @@ class RigRemap:
         """The pixels of the view that show something of a picture, (H', W')."""
         return np.bincount(self.reads.pixels, minlength=self._count).reshape(self.view_size) > 0
 
+    @property
+    def seen_by(self) -> np.ndarray:
+        """Whether each of the n cameras sees each pixel of the view, (n, H', W')."""
+        return self._seen.room.reshape(-1, *self.view_size) >= 0
+
     # -- frames -------------------------------------------------------------------------------
 
     def __call__(self, frames: Frames) -> Any:
@@ -143,7 +148,7 @@ class RigRemap:
         Raises:
             TypeError, ValueError: frames are missing, unknown, of other sizes or of unequal types.
         """
-        frames = in_order(frames, self.rig)
+        frames = checked(frames, self.rig)
         gains = self.gains(frames) if self.gain else None
         if isinstance(frames[0], Tensor):
             return self._mixed([View.floating(self.view, f, torch.float32) for f in frames], gains)
@@ -169,7 +174,7 @@ class RigRemap:
             (H', W'), of the same dtype. It is `IGNORE` (255) in uint8, and 0 in others, where the
             view shows nothing.
         """
-        targets = in_order(targets, self.rig, maps=True)
+        targets = checked(targets, self.rig, maps=True)
         kind = targets[0].dtype.newbyteorder("=")
         picture = np.full(self._count, IGNORE if kind == np.uint8 else 0, kind)
         for target, middles in zip(targets, self._middles, strict=True):
@@ -203,7 +208,7 @@ class RigRemap:
             check(name, repr(kind), kind in ("distance", "z"), "distance or z")
         if self.view.is_surface or self.rig.spread > _ONE_PLACE:
             raise ValueError("distances are those of a view if all cameras are at its place")
-        depths = in_order(depths, self.rig, maps=True)
+        depths = checked(depths, self.rig, maps=True)
         distances = np.full(self._count, np.nan)
         for depth, middles in zip(depths, self._middles, strict=True):
             flat, width = np.ascontiguousarray(depth).ravel(), depth.shape[1]
@@ -235,13 +240,13 @@ class RigRemap:
             C) float32, from the frames of both.
         """
         values = []
-        for frame, pixels in zip(in_order(frames, self.rig), self._seen.pixels, strict=True):
+        for frame, pixels in zip(checked(frames, self.rig), self._seen.pixels, strict=True):
             images = frame
             if isinstance(frame, np.ndarray):
                 images = as_tensor(np.atleast_3d(frame)).movedim(2, 0)[None]
             read = read_at(images.detach().float(), np.nan_to_num(pixels))
             values.append(read.flatten(0, 1).T.cpu().numpy())
-        shown = self._seen.room >= 0
+        shown = self._seen.room >= _RIM
         pairs = {}
         for a, b in itertools.combinations(range(len(values)), 2):
             both = np.flatnonzero(shown[a] & shown[b])
@@ -261,7 +266,7 @@ class RigRemap:
         rows, goals = [np.ones(len(names))], [0.0]
         for (a, b), (_, (first, second)) in self.overlaps(frames).items():
             inside = np.ones(first.shape[:1], bool)
-            if in_order(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
+            if checked(frames, self.rig)[0].dtype in (np.uint8, torch.uint8):
                 both = np.concatenate((first, second), 1)
                 inside = np.all((both >= _GREY[0]) & (both <= _GREY[1]), axis=1)
             sums = first[inside].sum(dtype=np.float64), second[inside].sum(dtype=np.float64)
@@ -314,12 +319,6 @@ class RigRemap:
         from darswin.frames.plan_files import check_size
         from darswin.frames.rig_plans import RigPlan  # the compiled module
 
-        mean, std = self.view.mean if mean is None else mean, self.view.std if std is None else std
-        if output == "uint8":
-            mean, std = 0.0, 1.0
-        if mean is None or std is None:
-            raise ValueError("frames are normalized: give the mean and the std of the network")
-        channels = max(np.size(mean), np.size(std))
         sizes, reads = [check_size(c.size) for c in self.rig.cameras.values()], self.reads
         factors = np.asarray(np.ones(len(sizes)) if gains is None else gains, np.float32)
         columns, rows, right, lower = corners(reads.points, np.array(sizes)[reads.sources].T)
@@ -329,8 +328,7 @@ class RigRemap:
             sources=reads.sources, columns=columns.astype(np.int16), rows=rows.astype(np.int16),
             right=right.astype(np.float32), lower=lower.astype(np.float32),
             weights=reads.weights * factors[reads.sources], sizes=tuple(sizes),
-            names=self.rig.names, output=output, mean=per_channel("mean", mean, channels),
-            std=per_channel("std", std, channels),
+            names=self.rig.names, **form_of_frames(self.view, output, mean, std),
         )  # fmt: skip
 
     # -- of the rig alone ---------------------------------------------------------------------

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.rig import Camera, Rig, is_in
+from darswin.utils.named import in_order
 from darswin.views.base import Pair
 
 Seam = Literal["hard", "narrow", "wide"]
@@ -72,21 +73,24 @@ def see(view: Any, rig: Rig, distance: float | None, points: np.ndarray) -> Seen
 
 def shares(room: np.ndarray, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
     """The cameras from which P points are read, (m, P), and their weights, (m, P): m is 1 for hard
-    seams, and else 2. Weights are 0 where no camera sees a point."""
+    seams, 2 for narrow and n for wide ones. Weights are 0 where no camera sees a point."""
     first = room.argmax(0)[None]
     most = np.take_along_axis(room, first, 0)
     seen = (most >= 0).astype(np.float64)
+    if seam == "wide":
+        rooms = room.clip(min=0)
+        total = rooms.sum(0)
+        # At the rims of all cameras that see it, a point is of the first one.
+        alone = np.arange(len(room))[:, None] == first
+        weights = np.where(total > 0, rooms / np.where(total > 0, total, 1), alone * seen)
+        return np.broadcast_to(np.arange(len(room))[:, None], room.shape), weights
     if seam == "hard" or len(room) == 1:
         return first, seen
     others = room.copy()
     np.put_along_axis(others, first, -1.0, 0)
     second = others.argmax(0)[None]
     more = np.take_along_axis(others, second, 0)
-    if seam == "wide":
-        share = more.clip(min=0) / np.maximum(most + more, 1e-12)
-    else:
-        share = (0.5 - (most - more) / (2 * _NARROW)).clip(min=0)
-    share = np.where(more >= 0, share, 0.0) * seen
+    share = np.where(more >= 0, 0.5 - (most - more) / (2 * _NARROW), 0).clip(min=0) * seen
     return np.concatenate((first, second)), np.concatenate((seen - share, share))
 
 
@@ -172,20 +176,14 @@ def read_at(image: Tensor, points: np.ndarray) -> Tensor:
     return torch.lerp(upper, under, lower)
 
 
-def in_order(frames: Frames, rig: Rig, maps: bool = False) -> list[Any]:
+def checked(frames: Frames, rig: Rig, maps: bool = False) -> tuple[Any, ...]:
     """Frames of the cameras of a rig in their order, or maps of labels or distances.
 
     Raises:
         TypeError: a frame is no array and no tensor, or they are of several types or channels.
         ValueError: a frame is missing, unknown or of another size. Both errors name the camera.
     """
-    if isinstance(frames, Mapping):
-        for name in {*frames} ^ {*rig.names}:
-            what = "is missing" if name in rig.names else f"is none of {', '.join(rig.names)}"
-            raise ValueError(f"the frame {name!r} {what}")
-        frames = [frames[name] for name in rig.names]
-    if isinstance(frames, np.ndarray | Tensor) or len(frames) != len(rig):
-        raise ValueError(f"there must be a frame for each of {len(rig)} cameras")
+    frames = in_order(frames, rig.names)
     kinds = set()
     for frame, (name, camera) in zip(frames, rig.cameras.items(), strict=True):
         if not isinstance(frame, np.ndarray) and (maps or not isinstance(frame, Tensor)):
@@ -203,4 +201,4 @@ def in_order(frames: Frames, rig: Rig, maps: bool = False) -> list[Any]:
         kinds.add((is_array, dtype, channels))
     if len(kinds) > 1:
         raise TypeError(f"all frames must have one type and one number of channels, got {kinds}")
-    return list(frames)
+    return frames

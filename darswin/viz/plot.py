@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -47,7 +47,7 @@ SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".tif": "tiff",
            ".tiff": "tiff", ".pdf": "pdf", ".svg": "svg"}  # fmt: skip
 # The style of areas without an image.
-HATCH = dict(facecolor="0.9", hatch="///", edgecolor="0.6", linewidth=0)
+HATCH: dict[str, Any] = dict(facecolor="0.9", hatch="///", edgecolor="0.6", linewidth=0)
 
 
 def figure_format(path: str | os.PathLike) -> str:

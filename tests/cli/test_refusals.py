@@ -16,6 +16,7 @@ from lens_examples import FILES, FRONT
 from darswin import create_model, lens, load_model
 from darswin.cli.main import main
 from darswin.lens import Polynomial, to_dict
+from darswin.lens.rig import CUBES
 from darswin.models.saving import ModelCard, save_model
 
 # By the beginning of a command, its wrong continuations, and what is said of them.
@@ -120,6 +121,52 @@ REFUSED = {
         form.json --out new => is not in COCO's form: expected str
         set/outside.json --out new => outside of the folder set/images, .*p.png: name them relative
         two --out new => 2 files of labels: give one of them.*other.json
+    """,
+    "rig": r"""
+        turn cube:8 => invalid choice: 'turn'
+        show front.json => front.json: it has no poses: files of rigs are those of Kalibr
+        show poses.json => which way its poses go: give --direction, camera_to
+        show poses.json --direction camera_to_rig => which way is up in its frame: give --up$
+        show cube:big => a cube is cube:SIDE, with the side of its pictures in px, got cube:big
+        show cube:8 --height 2 => --height must be left out for a cube, got 2.0
+        show cube:8 --out rig.gif => must end in one of \.png
+        show cube:8 in => ^darswin: in/p.png is of no camera: they are front, right, ba
+        show cube:8 in cube => in must be NAME=PATH, or a folder that is given alone
+        show cube:8 p.png => p.png must be a folder with a picture of each camera
+        show cube:8 gone => no file or folder gone
+        show cube:8 front=cube/up.png => there is no picture of the camera right$
+        show cube:8 front=p.png front=in/p.png => p.png and in/p.png are both of the camera front
+        show cube:8 front=p.png right=cubes/right => give either a picture or a folder of each
+        show cube:8 cubes => the camera right has no frame 2, but others have
+        show cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
+        check cube:8 cube --out cube/up.png => --out cube/up.png would replace cube/up.png, which
+        check cube:8 cube => no two cameras see the same places
+        stitch cube:8 --out new.png => missing pictures: give a folder
+        stitch cube:8 two_faces --out new.png => no picture of the camera back in two_faces$
+        stitch cube:9 cube --out new.png => cube/front.png must be of 9 × 9 px .*, got 8 × 8 px
+        stitch cube:8 cube --out new.gif => --out must be a file that ends in one of .bmp
+        stitch cube:8 cube --out cube/up.png => --out cube/up.png would replace
+    """,
+    "rig stitch cube:8 cube --out new.png": r"""
+        --view ground => below all cameras: give --height, in metres
+        --view square => --view must be one of ground, cylindrical, .* got square
+        --span 3 => --span must be left out unless the view is the ground, got 3.0
+        --size 0,4 => --size must be at least 2,2
+        --seam soft => --seam must be one of hard, narrow, wide, got soft
+        --distance 0 => --distance must be above
+        --view perspective --fov_deg 200 => --fov_deg must be above 0° and at most 179.9°
+    """,
+    "rig fisheye": r"""
+        cube --to wide.json => required: --out
+        gone --to wide.json --out new => no file or folder gone
+        cube --to bare.json --out new => bare.json has no image_size: give --size
+        cube --to wide.json --out cube/new => --out must be a folder outside of cube, got cube/new
+        cube --to wide.json --out more => --out more holds other files
+        cube --to wide.json --out new --faces opengl => back.png is of no camera: they are \+x, -x
+        cube --to wide.json --out new --depth_unit 0 => --depth_unit must be a finite number of met
+        kinds --to wide.json --out new => missing --depth_unit: .* such as kinds/depth/front.png
+        lone_depth --to wide.json --out new => no folder lone_depth/colour beside lone_depth/depth
+        apart --to wide.json --out new => colour and labels do not both have the frame 1
     """,
     "lens": r"""
         draw front.json => invalid choice: 'draw'
@@ -295,6 +342,7 @@ FILES_OF_TEXT = {
     "other.json": {"name": "A camera", "focal_mm": 2.1},
     "front.json": to_dict(FRONT),
     "bare.json": to_dict(Polynomial([300.0], 1.5)),
+    "poses.json": {"cameras": {"left": to_dict(FRONT) | {"pose": np.eye(4).tolist()}}},
     "wrong.json": {"model": "Spherical"},
     "out/undistorted.json": [],
     "boards/0.png": "no picture",
@@ -332,6 +380,12 @@ def world(tmp_path_factory):
     noise = np.random.default_rng(0).integers(256, size=(64, 96, 3), dtype=np.uint8)
     pictures = dict.fromkeys(("p.png", "in/p.png", "out/p.png", "more/own/b.png"), noise)
     pictures |= {f"{name}/images/0.png": noise for name in ("set", "deep/set", "lone")}
+    cubes = {"cube": "", "cubes": "/1", "kinds/colour": "", "kinds/depth": "", "two_faces": "",
+             "lone_depth/depth": "", "apart/colour": "/1", "apart/labels": "/2"}  # fmt: skip
+    for name, frame in cubes.items():
+        faces = CUBES["carla"][: 2 if name == "two_faces" else 6]
+        pictures |= {f"{name}/{face}{frame}.png": np.zeros((8, 8)) for face in faces}
+    pictures["cubes/front/2.png"] = noise
     pictures |= {"even.png": np.full((90, 120, 3), 80, np.uint8)}
     sizes = {"front.png": (483, 640, 3), "turned.png": (640, 483, 3), "square.png": (40, 40, 3)}
     pictures |= {name: np.zeros(size) for name, size in sizes.items()}

@@ -30,6 +30,7 @@ from videos import write_video
 
 from darswin import frames, lens
 from darswin.cli.main import main
+from darswin.lens.rig import CUBES
 from darswin.viz.report import largest_offset
 
 ROOT = Path(__file__).parents[2]
@@ -84,6 +85,9 @@ def granted(tmp_path_factory):
     picture = write_classes(folder / "photos")
     for name in ("a.jpg", "b.jpg"):
         cv2.imwrite(str(folder / name), picture)
+    (folder / "faces").mkdir()
+    for name in CUBES["carla"]:
+        cv2.imwrite(str(folder / "faces" / f"{name}.png"), cv2.resize(picture, (64, 64)))
     write_plain(folder / "garage", 20, split="train")
     write_plain(folder / "garage", 4, split="val")
     write_woodscape(folder / "woodscape", 20)

@@ -33,6 +33,7 @@ import learned_tables  # noqa: E402
 import lens  # noqa: E402
 import levels  # noqa: E402
 import pretrained_tables  # noqa: E402
+import rig_axes  # noqa: E402
 import sizes_tables  # noqa: E402
 import tables  # noqa: E402
 import views  # noqa: E402
@@ -109,6 +110,7 @@ FIGURES: dict[str, Callable[[Path], Figure | None]] = {
         record("studies/results/pretrained.json")["tables"]["CenterNet, level"]["methods"], path
     ),
     "pretrained found": draw_detections,
+    "rig axes": lambda path: rig_axes.draw_rigs(),
     "sizes": lambda path: sizes_tables.draw_scores(
         record("studies/results/sizes.json")["cells"], path
     ),

@@ -36,7 +36,7 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
     `class_of` maps every id that the file may hold to its class or to `IGNORE`; without it, the ids
     are those of the classes.
     """
-    labels = _read_ids(path)
+    labels = read_ids(path)
     known = {k: k for k in range(classes)} if class_of is None else class_of
     table = np.full(256, IGNORE, np.uint8)
     table[[id_ for id_ in known if id_ < 256]] = [known[id_] for id_ in known if id_ < 256]
@@ -59,7 +59,7 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
     return table[labels]
 
 
-def _read_ids(path: Path) -> np.ndarray:
+def read_ids(path: Path) -> np.ndarray:
     """The ids in a PNG of 1 to 8 bits, grey or with a palette, (H, W) uint8.
 
     They are the numbers that the file stores. A palette of different greys alone is an exception:

@@ -110,7 +110,8 @@ def load_up(path: str | os.PathLike) -> tuple[float, float, float]:
 
 
 class Calibration:
-    """A parsed calibration file: its format and its cameras, which are read on demand."""
+    """A parsed calibration file: its format and its cameras, which are read on demand. `fields` are
+    its entries, or the rows of a table."""
 
     def __init__(self, text: str, name: str, coefficients: str | None = None):
         self.what, self._text = f"calibration {name}", text  # for errors
@@ -133,7 +134,7 @@ class Calibration:
                     "coefficients", repr(coefficients), known, f"one of {', '.join(opencv.MODELS)}"
                 )
             fields = content if isinstance(content, list) else Fields(content)
-            self._fields = fields
+            self.fields = fields
             self._cameras = self.format.cameras(fields, coefficients)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
@@ -156,13 +157,13 @@ class Calibration:
     def up(self) -> tuple[float, float, float]:
         """The result of `load_up`."""
         with self._about():
-            x, y, z = self.format.up(self._fields)
+            x, y, z = self.format.up(self.fields)
         return x, y, z
 
     def supported(self) -> float | None:
         """rad: the angle up to which corners support the lens, or None if the file does not say. It
         holds for crops of the camera's pictures, and for a lens of another model fitted to it."""
-        return self.format.supported(self._fields)
+        return self.format.supported(self.fields)
 
     def has_several(self) -> bool:
         """True if its cameras are not all the same."""
@@ -263,7 +264,7 @@ class Calibration:
 
     def _missed(self) -> float:
         """px by which the calibration missed its corners; 0 if the file does not say."""
-        entries = {} if isinstance(self._fields, list) else self._fields.entries
+        entries = {} if isinstance(self.fields, list) else self.fields.entries
         said = (value for name, value in entries.items() if plain_name(str(name)) in _MISSED)
         return next((float(value) for value in said if is_number(str(value))), 0.0)
 

@@ -126,7 +126,7 @@ class MultiView(OpenCV):
         return has_several(content, VIEWS)
 
     def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
-        numbers = {key: _flat(file.get(key, "the numbers of all cameras")) for key in VIEWS}
+        numbers = {key: numbers_of(file.get(key, "the numbers of all cameras")) for key in VIEWS}
         count, entries = max(len(numbers["is_fisheye"]), 1), dict[str, Any]()
         for key, values in numbers.items():
             if not values or len(values) % count:
@@ -149,7 +149,7 @@ class MultiView(OpenCV):
         return mapping(zip((str(name).strip() for name in names), cameras, strict=True))
 
 
-def _flat(value: Any) -> list:
+def numbers_of(value: Any) -> list:
     """The numbers of a matrix, or of lists of lists of lists."""
     if isinstance(value, Mapping):
         value = value.get("data")

@@ -65,14 +65,20 @@ def save(
     format = format_of(path, format)
     writer = WRITTEN[format]
     replace_file(path, writer.write(lens, Path(path).suffix.lower(), supported))
+    warn_of_rays_beyond(lens, path, format)
+    return format
+
+
+def warn_of_rays_beyond(lens: Lens, path: str | os.PathLike, format: str) -> None:
+    """The warning of `save`."""
     end, kind = math.degrees(lens.theta_max.item()), type(lens).__name__
     if end > 90 and kind in IN_FRONT[format].split():
         text = (
-            f"{os.fspath(path)}: {writer.name} has no pixels for rays of 90° and more from the "
-            f"axis of a {kind} lens, and wrong rays for their pixels, but this sees {end:.4g}°"
+            f"{os.fspath(path)}: {WRITTEN[format].name} has no pixels for rays of 90° and more "
+            f"from the axis of a {kind} lens, and wrong rays for their pixels, but this sees "
+            f"{end:.4g}°"
         )
-        warnings.warn(text, stacklevel=2)
-    return format
+        warnings.warn(text, stacklevel=3)
 
 
 def format_of(path: str | os.PathLike, format: str | None) -> str:

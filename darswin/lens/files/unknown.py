@@ -52,6 +52,7 @@ PROGRAMS = (
     ("iKalibr", r"\bpolymorphic_name\b \bptr_wrapper\b \bdisto_param\b", _BY_NAME),
     ("Isaac Sim", r"\bomni:lensdistortion:\w+", _BY_NAME),
     ("COLMAP's rigs", '"image_prefix" "cameras"', "take cameras.txt beside it"),
+    ("darswin's rigs", '"direction" "cameras" "lens"', "Rig.load reads it"),
     ("DSO or 4Seasons", r"\A\s*(?:(Pinhole|FOV|RadTan|EquiDistant|KannalaBrandt)\s+[-+.\d]|"
      r"(?:[-+.\de]+\s+){6,16}(crop|full|none)\b)", _BY_NAME),
     ("fisheye-calib-adapter", "^image: ^parameter:", _BY_NAME),

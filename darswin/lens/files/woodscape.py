@@ -1,11 +1,13 @@
 """WoodScape's and SynWoodScape's JSON: `intrinsic` holds a polynomial of the angle."""
 
-import math
 from collections.abc import Mapping
+
+import numpy as np
 
 from darswin.lens.files.fields import Fields
 from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
 from darswin.lens.polynomial import Polynomial
+from darswin.utils.poses import from_quaternion
 
 # k₁, px per rad, is at least this even for images of a few dozen pixels.
 LEAST_K1 = 10.0
@@ -28,13 +30,14 @@ class WoodScape(Format):
         return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
 
     def up(self, file: Fields) -> list[float]:
-        # The quaternion turns vectors of the camera to the vehicle's frame, whose z axis is up.
-        x, y, z, w = file.section("extrinsic").numbers("quaternion", (4,))
-        length = math.hypot(x, y, z, w)
-        if not length > 0:
-            raise ValueError("extrinsic.quaternion must not be zero")
-        x, y, z, w = (value / length for value in (x, y, z, w))
-        return [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+        return [float(x) for x in camera_to_vehicle(file)[2]]
+
+
+def camera_to_vehicle(file: Fields) -> np.ndarray:
+    """The rotation (3, 3) of vectors of the camera's frame to the vehicle's: x forward, y left, z
+    up."""
+    x, y, z, w = file.section("extrinsic").numbers("quaternion", (4,))
+    return from_quaternion("extrinsic.quaternion", w, x, y, z)
 
 
 def _camera(file: Fields) -> Description:
