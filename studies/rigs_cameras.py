@@ -202,6 +202,7 @@ def four_cameras(out: Path) -> dict:
         cases[name] = dict(
             psnr=psnr(image, true, free & remap.shown), median=np.nanmedian(off),
             most=np.nanquantile(off, 0.95), disagreement=float(np.nanmean(apart)),
+            middle=float(np.nanmedian(apart)), bare=float(np.nanmean(apart[free])),
             ratio=max(value / before[pair] for pair, value in pairs.items()),
             pairs={" and ".join(pair): value for pair, value in pairs.items()},
         )  # fmt: skip

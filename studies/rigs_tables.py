@@ -89,11 +89,11 @@ def car(record: dict) -> str:
     """A row a rig."""
     rows = [
         [name, f"{case['psnr']:.1f}", f"{case['median'] + 0:.1f}", f"{case['most'] + 0:.1f}",
-         f"{case['disagreement']:.1f}", f"{case['ratio']:.1f}"]
+         *(f"{case[kind]:.1f}" for kind in ("disagreement", "middle", "bare", "ratio"))]
         for name, case in record["car"]["cases"].items()
     ]  # fmt: skip
-    header = ["rig", "PSNR (dB)", "shift, median (cm)", "95 % (cm)", "difference", "worst pair"]
-    return markdown(header, rows)
+    header = ["rig", "PSNR (dB)", "shift, median (cm)", "95 % (cm)", "difference, mean"]
+    return markdown([*header, "median", "bare ground", "worst pair"], rows)
 
 
 def seams(record: dict) -> str:
