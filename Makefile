@@ -34,7 +34,7 @@ PYTEST := OMP_NUM_THREADS=1 $(ROOT)/$(BIN)/python -m pytest -n auto --maxprocess
 # the kernels, which differ from tier to tier.
 KERNELS := $(addprefix $(ROOT)/tests/,$(foreach name,blocks contract gathers linear polar_sample \
   polar_to_image properties quantized_blocks window_attention,ops/test_$(name).py) \
-  frames/test_plans.py deploy/test_contract.py)
+  frames/test_plans.py frames/test_rig_plans.py deploy/test_contract.py)
 COMPILED := $(addprefix $(ROOT)/tests/,ops frames deploy/test_contract.py deploy/test_record.py)
 TIERS = $$($(ROOT)/$(BIN)/python -c 'from darswin.ops import _module; print(*reversed(_module.tiers()))')
 
@@ -150,6 +150,7 @@ bench: build  ## time the operators, training and a model against alternatives; 
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/one_frame.py --out benchmarks/results
 	$(BIN)/python benchmarks/frames.py --out benchmarks/results
+	$(BIN)/python benchmarks/rig.py --out benchmarks/results
 	$(BIN)/python benchmarks/steps.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python benchmarks/model.py --out benchmarks/results

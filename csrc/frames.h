@@ -65,7 +65,8 @@ constexpr int64_t kRigReads = 256;
 struct RigRun {
   int32_t count;
   uint8_t source;
-  bool in_order;  // they belong to pixels that follow each other
+  bool in_order;    // they belong to pixels that follow each other
+  bool unweighted;  // all weights are 1
 };
 
 // A pixel is the sum of its reads, which are bilinear samples times their weights.

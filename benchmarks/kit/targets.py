@@ -35,6 +35,14 @@ MODEL_TARGETS = {
 # Of training steps of all models, at any number of threads. On CPUs whose MKL is fast, our step
 # and that with torch's products are one.
 STEP_TARGETS = {BY_TORCH: 0.97, REFERENCE: 1.2, COMPILED: 1.0, FORWARD: 0.2}
+# Of the ground from four cameras, by seam: the smallest ratios of peers' times over ours on one
+# thread, and of our time on one thread over that on all.
+RIG_TARGETS = {
+    "hard": {"OpenCV in rectangles": 1 / 0.28, "four cv2.remap + NumPy": 1 / 0.15,
+             f"{OURS}, 1 thread": 1.7},
+    "narrow": {"OpenCV in rectangles": 1 / 0.32, "four cv2.remap + NumPy": 1 / 0.15,
+               f"{OURS}, 1 thread": 1.7},
+}  # fmt: skip
 MEMORY_TARGET = 0.8  # the largest ratio of the peak of a training step over the reference's
 # For frames at the pace of a camera: the least ratio of our median over our p99, and of our times
 # on one thread over those on more.

@@ -66,12 +66,12 @@ RigSampler::RigSampler(const RigPlan& plan)
   for (auto* numbers : {&right, &lower}) numbers->resize(reads + kFrameSpare);
 }
 
-void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t first) {
-  groups.push_back({begin, first, static_cast<int64_t>(runs.size())});
+void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read) {
+  groups.push_back({begin, read, static_cast<int64_t>(runs.size())});
   std::vector<std::pair<int64_t, uint8_t>> reads;  // and their pixels
   for (int64_t pixel = begin; pixel < end; ++pixel) {
     for (int k = 0; k < plan.counts[pixel]; ++k) {
-      reads.emplace_back(first++, static_cast<uint8_t>(pixel - begin));
+      reads.emplace_back(read++, static_cast<uint8_t>(pixel - begin));
     }
   }
   // Blocks of one source are long, and a pixel has few reads of each.
@@ -82,11 +82,12 @@ void RigSampler::add_group(const RigPlan& plan, int64_t begin, int64_t end, int6
   for (const auto& [k, pixel] : reads) {
     if (runs.size() == static_cast<size_t>(groups.back().run) ||
         runs.back().source != plan.sources[k]) {
-      runs.push_back({0, plan.sources[k], true});
+      runs.push_back({0, plan.sources[k], true, true});
       last = pixel - 1;
     }
     ++runs.back().count;
     runs.back().in_order &= pixel == ++last;
+    runs.back().unweighted &= plan.weights[k] == 1;
     columns.push_back(plan.columns[k]), rows.push_back(plan.rows[k]);
     right.push_back(plan.right[k]), lower.push_back(plan.lower[k]);
     weights.push_back(plan.weights[k]), pixels.push_back(pixel);

@@ -37,7 +37,7 @@ class RigSampler {
 
  private:
   // Appends the reads of one group of pixels from a plan.
-  void add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t first);
+  void add_group(const RigPlan& plan, int64_t begin, int64_t end, int64_t read);
 
   const int64_t height, width;
   const std::vector<std::pair<int64_t, int64_t>> sizes;

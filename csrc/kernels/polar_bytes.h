@@ -14,23 +14,18 @@ namespace {
 
 constexpr int64_t kByteBlock = 256;  // points; their words stay in the first-level cache
 
-// A corner of the points of a block: 8 bits of each word.
-struct Corner {
-  const uint32_t* words;
-  int shift;
+using PointWords = Vector<uint32_t, kLanes<float>>;
 
-  Floats read(int64_t k) const {
-    using Bits = Vector<uint32_t, kLanes<float>>;
-    using Ints = Vector<int32_t, kLanes<float>>;
-    const Bits bits = (load<Bits>(words + k) >> shift) & 0xFF;
-    return __builtin_convertvector((Ints)bits, Floats);
-  }
-};
+// 8 bits of each word.
+inline Floats byte_of(PointWords words, int shift) {
+  const PointWords bits = (words >> shift) & 0xFF;
+  return __builtin_convertvector((Vector<int32_t, kLanes<float>>)bits, Floats);
+}
 
 struct ByteBlock {
   int32_t offset[kByteBlock];
-  uint32_t words[4][kByteBlock];
-  float samples[3][kByteBlock];  // of each channel
+  uint32_t words[2][2 * kByteBlock];  // of the upper and the lower pixels
+  float samples[3][kByteBlock];       // of each channel
 
   // Samples points of an image. `offset` has those of their upper left pixels, whose neighbours are
   // in the image too. Up to a register of `right` and `lower` is read behind the last point.
@@ -41,17 +36,15 @@ struct ByteBlock {
       // The channels of a pixel are neighbours, in this order or the reverse. A word begins with a
       // pixel, or ends with its right neighbour, so it stays inside the image.
       const uint8_t* pixels = plane == 1 ? image.pixels : image.pixels - 2;
+      const auto pair = [&](const uint8_t* left) {
+        const uint64_t right = load_bits<uint32_t>(left + next - 1);
+        return load_bits<uint32_t>(left) | right << 32;
+      };
       for (int64_t k = 0; k < count; ++k) {
-        const uint8_t *top = pixels + offset[k], *bottom = top + below;
-        words[0][k] = load_bits<uint32_t>(top), words[1][k] = load_bits<uint32_t>(top + next - 1);
-        words[2][k] = load_bits<uint32_t>(bottom);
-        words[3][k] = load_bits<uint32_t>(bottom + next - 1);
+        const uint8_t* top = pixels + offset[k];
+        store_bits(words[0] + 2 * k, pair(top)), store_bits(words[1] + 2 * k, pair(top + below));
       }
-      for (int c = 0; c < 3; ++c) {
-        const int shift = 8 * (plane == 1 ? c : 2 - c);
-        compute(image, c, {words[0], shift}, {words[1], shift + 8}, {words[2], shift},
-                {words[3], shift + 8}, right, lower, count);
-      }
+      compute<2>(image, 0, 3, plane == 1 ? 0 : 16, plane == 1 ? 8 : -8, right, lower, count);
       return;
     }
     for (int64_t c = 0; c < image.channels; ++c) {
@@ -59,13 +52,12 @@ struct ByteBlock {
       for (int64_t k = 0; k < count; ++k) {
         const uint8_t *top = pixels + offset[k], *bottom = top + below;
         if (next == 1) {
-          words[0][k] = load_bits<uint16_t>(top), words[2][k] = load_bits<uint16_t>(bottom);
+          words[0][k] = load_bits<uint16_t>(top), words[1][k] = load_bits<uint16_t>(bottom);
         } else {
-          words[0][k] = top[0] | top[next] << 8, words[2][k] = bottom[0] | bottom[next] << 8;
+          words[0][k] = top[0] | top[next] << 8, words[1][k] = bottom[0] | bottom[next] << 8;
         }
       }
-      compute(image, c, {words[0], 0}, {words[0], 8}, {words[2], 0}, {words[2], 8}, right, lower,
-              count);
+      compute<1>(image, c, c + 1, 0, 0, right, lower, count);
     }
   }
 
@@ -93,16 +85,30 @@ struct ByteBlock {
   }
 
  private:
-  // Computes the samples of channel c.
-  void compute(const ByteImage& image, int64_t c, Corner top_left, Corner top_right,
-               Corner bottom_left, Corner bottom_right, const float* right, const float* lower,
-               int64_t count) {
-    const auto scale = splat<Floats>(image.scale[c]), shift = splat<Floats>(image.offset[c]);
-    for (int64_t k = 0; k < count; k += kLanes<float>) {
-      const Floats v =
-          bilinear(top_left.read(k), top_right.read(k), bottom_left.read(k), bottom_right.read(k),
-                   load<Floats>(right + k), load<Floats>(lower + k));
-      store(samples[c] + k, normalized(v, scale, shift));
+  // Computes the samples of channels [c, last) from one word for each point, or two: one of the
+  // left pixel and one of the right, whose bytes begin 8 bits later. `step` is from a channel to
+  // the next.
+  template <int kWords>
+  void compute(const ByteImage& image, int64_t c, int64_t last, int shift, int step,
+               const float* right, const float* lower, int64_t count) {
+    const int64_t first = c;
+    for (int64_t k = 0; k < count; k += kLanes<float>, c = first) {
+      PointWords corners[2][2];
+      for (int row = 0; row < 2; ++row) {
+        const auto left = load<PointWords>(words[row] + kWords * k);
+        corners[row][0] = corners[row][1] = left;
+        if constexpr (kWords == 2) {
+          const auto others = load<PointWords>(words[row] + kWords * k + kLanes<float>);
+          corners[row][0] = evens(left, others), corners[row][1] = odds(left, others);
+        }
+      }
+      const auto x = load<Floats>(right + k), y = load<Floats>(lower + k);
+      for (int at = shift; c < last; ++c, at += step) {
+        const Floats v = bilinear(byte_of(corners[0][0], at), byte_of(corners[0][1], at + 8),
+                                  byte_of(corners[1][0], at), byte_of(corners[1][1], at + 8), x, y);
+        store(samples[c] + k,
+              normalized(v, splat<Floats>(image.scale[c]), splat<Floats>(image.offset[c])));
+      }
     }
   }
 };

@@ -103,7 +103,7 @@ def read_plan(path: str | os.PathLike, *kinds: type[Kind]) -> Kind:
             if arrays[name].dtype != dtype:
                 raise TypeError(f"its array {name!r} has another type")
         check_output(texts["output"])
-        parts = {name: arrays[name] for name in kind.kinds}
+        parts: dict[str, Any] = {name: arrays[name] for name in kind.kinds}
         for name in ("mean", "std"):
             parts[name] = tuple(arrays[name].tolist())
         return kind.of_file(parts | dict(output=texts["output"]), texts)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Plan(PlanFile):
 
     key = "darswin_plan"
     version = 5
-    kinds = dict(
+    kinds: ClassVar = dict(
         size=np.int64, mean=np.float64, std=np.float64, supersampling=np.int64,
         columns=np.int16, rows=np.int16, right=np.float32, lower=np.float32,
     )  # fmt: skip

@@ -2,13 +2,13 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from darswin.frames.plan_files import Output, PlanFile, check_output
 
-_READS = dict(
+_READS: dict[str, type[np.generic]] = dict(
     sources=np.uint8, columns=np.int16, rows=np.int16,
     right=np.float32, lower=np.float32, weights=np.float32,
 )  # fmt: skip
@@ -56,7 +56,9 @@ class RigPlan(PlanFile):
 
     key = "darswin_rig_plan"
     version = 1
-    kinds = dict(counts=np.uint16, sizes=np.int64, mean=np.float64, std=np.float64, **_READS)
+    kinds: ClassVar = dict(
+        counts=np.uint16, sizes=np.int64, mean=np.float64, std=np.float64, **_READS
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
