@@ -6,7 +6,7 @@ is a data set for `darswin fit --task segmentation` and `--task distance`. A ren
 stopped goes on. `make worlds` makes a small data set.
 
 With `--cube 512`, the pictures are the six faces of a cube, of 512 px each, as simulators write
-them: `darswin rig fisheye out/cubes/train --to lens.json --depth-unit 0.001 --out fisheye`.
+them: `darswin rig fisheye out/cubes/train --to lens.json --depth_unit 0.001 --out fisheye`.
 """
 
 import argparse
