@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-numerics test-all test-lowest test-isa sanitized test-asan test-tsan test-clang fuzz kills lint format bench gpu study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-numerics test-all test-lowest test-isa sanitized test-asan test-tsan test-clang fuzz kills lint format bench gpu study study-int8 learned-lens worlds study-dense study-sizes study-pretrained study-calibrate study-estimate study-rigs tables docs sdist wheels pure-wheel repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -205,6 +205,10 @@ study-calibrate: build $(CONTRIB)/installed  ## study calibrations from corners 
 
 study-estimate: build  ## study lenses estimated from lines (6 minutes; needs `apt-get install freedoom opencv-doc`)
 	$(BIN)/python studies/estimate.py
+
+study-rigs: build  ## study pictures of several cameras (a quarter of an hour; can be interrupted)
+	$(BIN)/pip install -q --no-deps py360convert==1.0.4
+	$(BIN)/python studies/rigs.py
 
 tables: $(STAMP)  ## fill the tables of README and docs with the results of bench and study
 	$(BIN)/python docs/fill.py

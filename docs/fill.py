@@ -162,6 +162,7 @@ def tables() -> dict[str, str]:
     import estimate_tables
     import learned_tables
     import pretrained_tables
+    import rigs_tables
     import sizes_tables
     import tables as study
 
@@ -185,6 +186,7 @@ def tables() -> dict[str, str]:
     pretrained = json.loads((studies / "pretrained.json").read_text())
     calibrated = json.loads((studies / "calibrate.json").read_text())
     estimated = json.loads((studies / "estimate.json").read_text())
+    rigs = json.loads((studies / "rigs.json").read_text())
     return {
         "demo": demo_table(demo),
         "demo line": demo_line(demo),
@@ -219,6 +221,7 @@ def tables() -> dict[str, str]:
         **pretrained_tables.tables(pretrained),
         **calibrate_tables.tables(calibrated),
         **estimate_tables.tables(estimated),
+        **rigs_tables.tables(rigs),
     }
 
 

@@ -41,12 +41,14 @@ _GREY = (4, 251)  # of 8 bits: what is darker or lighter says nothing about gain
 
 
 class Middles(NamedTuple):
-    """The pixels (K,) of a view that one camera shows best; the pixels nearest to their middles,
-    (K, 2), in its picture; their `corners`; and the cosines (K,) of the rays to its axis."""
+    """The pixels (K,) of a view that one camera shows best. In its picture, row by row: the pixels
+    nearest to their middles, (K,), and the upper left ones of the four around, (K,); the places
+    (2, K) from there to the right and down; and the cosines (K,) of the rays to its axis."""
 
     mine: np.ndarray
     nearest: np.ndarray
-    corners: tuple[np.ndarray, ...]
+    first: np.ndarray
+    shares: np.ndarray
     cosines: np.ndarray
 
 
@@ -178,8 +180,7 @@ class RigRemap:
         kind = targets[0].dtype.newbyteorder("=")
         picture = np.full(self._count, IGNORE if kind == np.uint8 else 0, kind)
         for target, middles in zip(targets, self._middles, strict=True):
-            x, y = middles.nearest.T
-            picture[middles.mine] = target[y, x]
+            picture[middles.mine] = target.ravel().take(middles.nearest)
         return picture.reshape(self.view_size)
 
     def depth(
@@ -209,26 +210,27 @@ class RigRemap:
         if self.view.is_surface or self.rig.spread > _ONE_PLACE:
             raise ValueError("distances are those of a view if all cameras are at its place")
         depths = checked(depths, self.rig, maps=True)
-        distances = np.full(self._count, np.nan)
+        distances = np.full(self._count, np.nan, np.float32)
         for depth, middles in zip(depths, self._middles, strict=True):
-            flat, width = np.ascontiguousarray(depth).ravel(), depth.shape[1]
-            columns, rows, right, lower = middles.corners
-            first = rows * width + columns
+            flat, width = depth.ravel().astype(np.float32, copy=False), depth.shape[1]
+            (right, lower), steps = middles.shares, (0, 1, width, width + 1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                four = np.stack([flat[first + step] for step in (0, 1, width, width + 1)])
-                four = np.where(four > 0, 1 / four, np.nan)
-                one_surface = four.max(0) <= _ONE_SURFACE * four.min(0)
-                across = four[::2] + (four[1::2] - four[::2]) * right
-                mixed = across[0] + (across[1] - across[0]) * lower
-                x, y = middles.nearest.T
-                nearest = flat[y * width + x]
-                far = np.where(one_surface, 1 / mixed, np.where(nearest > 0, nearest, np.nan))
-            distances[middles.mine] = far / middles.cosines if of == "z" else far
+                a, b, c, d = (1 / flat[step:].take(middles.first) for step in steps)
+                least = np.minimum(np.minimum(a, b), np.minimum(c, d))
+                most = np.maximum(np.maximum(a, b), np.maximum(c, d))
+                upper = a + (b - a) * right
+                mixed = upper + (c + (d - c) * right - upper) * lower
+                nearest = flat.take(middles.nearest)
+                nearest[~(nearest > 0)] = np.nan
+                # Not at infinity, nor where a depth is unknown.
+                one_surface = (least > 0) & (most <= _ONE_SURFACE * least) & (most < np.inf)
+                far = np.where(one_surface, 1 / mixed, nearest)
+                distances[middles.mine] = far / middles.cosines if of == "z" else far
         if to == "z":
             axis = getattr(self.view, "direction", (0.0, 0.0, 1.0))
             rays = self.view.places(torch.from_numpy(self._grid)[None])[0].numpy()
             distances *= rays @ np.array(axis)
-        return distances.reshape(self.view_size).astype(np.float32)
+        return distances.reshape(self.view_size)
 
     # -- where cameras overlap ----------------------------------------------------------------
 
@@ -373,9 +375,13 @@ class RigRemap:
             room = self._seen.room
             mine = np.flatnonzero((room.argmax(0) == number) & (room[number] >= 0))
             nudged = points[mine] + aside(self.view_size).reshape(-1, 2)[mine]
-            nearest = np.rint(nudged.clip(0, np.array(remap.size[::-1]) - 1)).astype(np.intp)
-            cosines = remap.rays_of_image(points[mine])[:, 2]
-            found.append(Middles(mine, nearest, corners(points[mine], remap.size), cosines))
+            x, y = np.rint(nudged.clip(0, np.array(remap.size[::-1]) - 1)).astype(np.intp).T
+            columns, rows, _, _ = corners(points[mine], remap.size)
+            # Beyond the middles of outer pixels, planes go on.
+            shares = (points[mine] - np.stack((columns, rows), 1)).astype(np.float32).T
+            cosines = remap.rays_of_image(points[mine])[:, 2].astype(np.float32)
+            nearest, first = (r * remap.size[1] + c for r, c in ((y, x), (rows, columns)))
+            found.append(Middles(mine, nearest, first, shares, cosines))
         return found
 
     def _mixed(self, images: list[Tensor], gains: np.ndarray | None) -> Tensor:

@@ -46,7 +46,7 @@ def write_map(name: str, split: str, targets: Sequence[Target], size: int, count
         t: dict(lenses=Path(t.lenses).name, fov=t.fov, size=size, count=count, seed=seed)
         for t in targets
     }
-    open_targets = [t for t in targets if not _is_done(_done(t, split, name), made[t])]
+    open_targets = [t for t in targets if not is_done(_done(t, split, name), made[t])]
     if not open_targets:
         return {}
     wad, world = load_map(name)
@@ -90,13 +90,14 @@ def jobs_of(
         Path(target.folder).mkdir(parents=True, exist_ok=True)
         classes = dict(names=CLASSES, colors=COLORS)
         replace_file(Path(target.folder) / "classes.json", json.dumps(classes) + "\n")
+    return [(name, split, targets, size, count, seed) for name, count in shares(split, pictures)]
+
+
+def shares(split: str, pictures: int) -> list[tuple[str, int]]:
+    """The maps of a split that show a number of pictures, and how many of them each shows."""
     names = map_names(split)
     counts = [len(part) for part in np.array_split(np.arange(pictures), len(names))]
-    return [
-        (name, split, targets, size, count, seed)
-        for name, count in zip(names, counts, strict=True)
-        if count
-    ]
+    return [(name, count) for name, count in zip(names, counts, strict=True) if count]
 
 
 def _lens_folder(target: Target) -> tuple[str, ...]:
@@ -107,7 +108,8 @@ def _done(target: Target, split: str, name: str) -> Path:
     return Path(target.folder) / split / "done" / f"{name}.json"
 
 
-def _is_done(file: Path, made: dict) -> bool:
+def is_done(file: Path, made: dict) -> bool:
+    """True if `file` says that a map was made with these options; ValueError if with others."""
     if not file.exists():
         return False
     before = json.loads(file.read_text())

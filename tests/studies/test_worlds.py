@@ -3,12 +3,15 @@
 import math
 import struct
 
+import cv2
 import numpy as np
 import omg
 import pytest
-from worlds import geometry, poses, render, scene, textures, wad
+from worlds import cubes, geometry, poses, render, scene, textures, wad
 
+from darswin import Rig
 from darswin.lens import Equidistant, Perspective, Spherical
+from darswin.views import CameraView
 
 LABEL = geometry.LABEL
 
@@ -119,6 +122,26 @@ def test_a_pixel_shows_what_its_ray_meets(box, lens):
     )
     assert {"liquid", "wall"} <= {geometry.CLASSES[k] for k in hits.label}
     assert (view.distance[view.labels == LABEL["sky"]] == 0).all()
+
+
+def test_a_cube_is_what_a_fisheye_sees(box, tmp_path, monkeypatch):
+    pose = poses.Pose(eye(300, 100, 60), poses.look(0.7, 0.2, -0.1))
+    for name, value in dict(load_map=(0, 0), Textures=0, Scene=box, poses_of=[pose]).items():
+        monkeypatch.setattr(cubes, name, lambda *_, value=value: value)
+    cubes.write_cubes("box-MAP01", "val", tmp_path, 64, 1, 0)
+
+    def faces(kind: str) -> dict:
+        files = {name: f"{tmp_path}/val/{kind}/{name}/box-MAP01-000.png" for name in rig.names}
+        return {name: cv2.imread(file, cv2.IMREAD_UNCHANGED) for name, file in files.items()}
+
+    lens, rig = Equidistant(12.0, theta_max=math.radians(100), image_size=(48, 48)), Rig.cube(64)
+    remap, true = CameraView(lens).at(rig), render.render(box, pose, render.rays_of(lens))
+    assert (remap.target(faces("labels")) == true.labels).mean() > 0.98
+    far = remap.depth({name: z / cubes.DEPTH_UNIT for name, z in faces("depth").items()})
+    off = np.abs(far / np.where(true.distance > 0, true.distance, np.nan) - 1)
+    assert np.nanmedian(off) < 1e-3 and np.nanquantile(off, 0.9) < 0.01
+    apart = np.abs(remap(faces("colour"))[..., ::-1].astype(float) - true.image)
+    assert np.median(apart) < 3
 
 
 @pytest.mark.slow
