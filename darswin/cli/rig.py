@@ -252,8 +252,7 @@ def _better(remap: "RigRemap", frames: dict[str, np.ndarray]) -> str:
 
     def apart(cameras: dict[str, Camera], numbers: list[int], points: np.ndarray) -> float:
         """The mean difference of some cameras from others at points; ∞ if most are lost."""
-        changed = Rig(cameras, up=rig.up, forward=rig.forward)
-        seen, parts = see(remap.view, changed, remap.distance, points), []
+        seen, parts = see(remap.view, rig.with_cameras(cameras), remap.distance, points), []
         reads = zip(images, np.nan_to_num(seen.pixels), strict=True)
         values = np.stack([read_at(image, pixels)[0].numpy() for image, pixels in reads])
         shown = seen.room >= 0
@@ -271,10 +270,10 @@ def _better(remap: "RigRemap", frames: dict[str, np.ndarray]) -> str:
         if not len(points):
             continue
         points = points[:: -(-len(points) // POINTS)].astype(np.float64)
-        now = apart(rig.cameras, numbers, points)
+        now = apart({}, numbers, points)
         for how, change in _changes(remap, names):
             moved = {name: rig[name]._replace(pose=change @ rig[name].pose) for name in names}
-            then = apart(rig.cameras | moved, numbers, points)
+            then = apart(moved, numbers, points)
             if then <= min(best * now, now - LEAST):
                 who, best = names[0] if len(names) == 1 else "all cameras", then / now
                 text = f"{who}: {how}, pictures agree better ({now:.1f} → {then:.1f})"

@@ -199,8 +199,13 @@ class Rig:
             raise ValueError(f"height must be a finite number of metres, got {height}")
         lift = np.eye(4)
         lift[:3, 3] = np.multiply(height, self.up)
-        cameras = {name: c._replace(pose=lift @ c.pose) for name, c in self.cameras.items()}
-        return type(self)(cameras, up=self.up, forward=self.forward)
+        return self.with_cameras(
+            {n: c._replace(pose=lift @ c.pose) for n, c in self.cameras.items()}
+        )
+
+    def with_cameras(self, cameras: Mapping[str, Any]) -> Self:
+        """The same rig with these cameras, see `Rig`, in place of those of their names, or more."""
+        return type(self)({**self.cameras, **cameras}, up=self.up, forward=self.forward)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -166,8 +166,7 @@ class RigRemap:
         return picture.astype(kind).reshape(*self.view_size, *frames[0].shape[2:])
 
     def target(self, targets: Frames) -> np.ndarray:
-        """Maps of labels in the view: each pixel takes the nearest of its best camera, never a
-        mixture.
+        """Maps of labels in the view: a pixel takes the nearest of its best camera, no mixture.
 
         Args:
             targets: arrays (H, W), as `frames`.
@@ -280,20 +279,19 @@ class RigRemap:
         return np.exp(np.linalg.lstsq(np.array(rows), np.array(goals))[0])
 
     def disagreement(self, frames: Frames) -> tuple[dict[tuple[str, str], float], np.ndarray]:
-        """How much the cameras differ where they overlap: a free check of the poses and lenses.
+        """How much cameras differ where they overlap, after `gain`: a check of poses and lenses.
 
         Returns:
             The mean difference of each pair, in units of the frames; and the largest at each pixel
             of the view, (H', W') float32, NaN where fewer than two cameras see it.
         """
-        picture = np.full(self._count, np.nan, np.float32)
-        means = {}
-        for pair, ((x, y), (first, second)) in (
-            (names, (places.T, values)) for names, (places, values) in self.overlaps(frames).items()
-        ):
-            apart = np.abs(first - second).mean(1)
+        picture, means = np.full(self._count, np.nan, np.float32), {}
+        factors = self.gains(frames) if self.gain else np.ones(len(self.rig))
+        gains = dict(zip(self.rig.names, factors.astype(np.float32), strict=True))
+        for pair, (places, (first, second)) in self.overlaps(frames).items():
+            apart = np.abs(first * gains[pair[0]] - second * gains[pair[1]]).mean(1)
             means[pair] = float(apart.mean())
-            at = y * self.view_size[1] + x
+            at = places @ (1, self.view_size[1])
             picture[at] = np.fmax(picture[at], apart)
         return means, picture.reshape(self.view_size)
 

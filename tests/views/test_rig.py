@@ -241,6 +241,7 @@ def test_gains_and_disagreement():
     tensors = [torch.from_numpy(f)[None, None] for f in darker.values()]
     np.testing.assert_allclose(remap(tensors)[0, 0], remap(darker), atol=1e-3)
     right = remap.disagreement(frames)[0]
+    assert remap.disagreement(darker)[0] == pytest.approx(right, rel=0.05)
     for wrong in (pose(92, 40, (1.9, 0.95, 1.0)), pose(90, 40, (1.9, 0.95, 1.05))):
         means, picture = (
             GroundView((60, 60), 9.0, (1.4, 0)).at(car(left=wrong)).disagreement(frames)
