@@ -9,7 +9,7 @@ import json
 import re
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -121,15 +121,16 @@ def frames_table(timings: Sequence[Timing]) -> str:
     return bench.markdown(["frame → samples", "ours (µs)", *peers], rows)
 
 
-def steps_text(records: Sequence[Record]) -> str:
-    """A sentence on the machine of each record of `benchmarks/steps.py`, and its table."""
+def text_of(suite: str, table: Callable[[Record], str]) -> str:
+    """A sentence on the machine of each record of a suite on any CPU, and its table."""
     texts = []
-    for record in records:
-        head, table = record.machine, bench.steps_table(record)
+    for path in sorted(RESULTS.glob(f"{suite}--*.json")):
+        record = Record.load(path)
+        head = record.machine
         assert not head["commit"].endswith("dirty")
         texts.append(
             f"On {head['cores']} cores of an {head['cpu']}, on the tier `{head['tier']}`, with "
-            f"the code of commit {head['commit']}:\n\n{table}"
+            f"the code of commit {head['commit']}:\n\n{table(record)}"
         )
     return "\n\n".join(texts)
 
@@ -204,7 +205,8 @@ def tables() -> dict[str, str]:
         "from frame": bench.paced_table(t for t in one_frame.timings if t not in single),
         "starts": bench.starts_table(one_frame.starts),
         "gpu": bench.gpu_text(gpus),
-        "steps": steps_text([Record.load(path) for path in sorted(RESULTS.glob("steps--*.json"))]),
+        "steps": text_of("steps", bench.steps_table),
+        "rig": text_of("rig", lambda record: peers.peers_table(record.timings, "rig")),
         "frames paced": bench.paced_table(frames.timings),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),
