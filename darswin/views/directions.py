@@ -103,7 +103,7 @@ class RayView(PixelView):
     def in_rig(self) -> Self:
         # Of a rig, a view without `fov` shows as much as its kind of map usually has.
         if getattr(self, "reach", None) is not None:
-            raise ValueError("`reach` follows one lens: give a view of a rig its `fov`")
+            raise ValueError("reach follows one lens: give a view of a rig its field of view, fov")
         fov = self.fov or self.usual_fov
         start = self._start(torch.zeros((), dtype=torch.float64))
         step = start.new_tensor([[2 * self.half_width(fov / 2) / self.size[1]]])

@@ -186,7 +186,7 @@ class Reader(NamedTuple):
             if self.image_size is None or "camera_model_name" not in camera:
                 raise ValueError(
                     f"camera {short(name)} has no lens: give the reconstruction's cameras.txt or "
-                    "cameras.bin as `cameras`, or `image_size` beside camera_model_name and "
+                    "cameras.bin as cameras=, or image_size= beside camera_model_name and "
                     "camera_params in the file"
                 )
             words = camera.of_kind("camera_params", list, "numbers")
