@@ -55,9 +55,9 @@ class Middles(NamedTuple):
 class RigRemap:
     """The map between the pictures of a rig's cameras and what a view shows of them together.
 
-    `view.at(rig)` makes it. Each point of a pixel is read from the camera whose axis is nearest, as
-    a share of θ_max, or from the two nearest, and a pixel is the mean of its points. Their number
-    follows the ratio of the scales. Points of a picture's outer half pixel count as on its border.
+    `view.at(rig)` makes it. Each point of a pixel is read from the camera that sees it farthest from
+    θ_max and from the border of its picture, or from several, and a pixel is the mean of its
+    points. Their number follows the ratio of the scales. Outer pixels extend to the borders.
 
     Frames are a list in the order of `rig.names`, or a mapping from names, which then decide.
 
