@@ -55,8 +55,8 @@ class Middles(NamedTuple):
 class RigRemap:
     """The map between the pictures of a rig's cameras and what a view shows of them together.
 
-    `view.at(rig)` makes it. Each point of a pixel is read from the camera that sees it farthest from
-    θ_max and from the border of its picture, or from several, and a pixel is the mean of its
+    `view.at(rig)` makes it. Each point of a pixel is read from the camera that sees it farthest
+    from θ_max and from the border of its picture, or from several, and a pixel is the mean of its
     points. Their number follows the ratio of the scales. Outer pixels extend to the borders.
 
     Frames are a list in the order of `rig.names`, or a mapping from names, which then decide.
