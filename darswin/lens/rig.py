@@ -14,9 +14,7 @@ from darswin.lens.ideal import Perspective
 from darswin.lens.image import Size
 from darswin.utils.angles import unit_vector
 from darswin.utils.parameters import naming
-from darswin.utils.poses import to_pose
-
-Vector = tuple[float, float, float]
+from darswin.utils.poses import ahead_of, frame_of, to_pose
 
 MOST_CAMERAS = 255
 # The faces of a cube in the order and by the names of these programs. Their geometry is the same:
@@ -223,10 +221,7 @@ class Rig:
     @property
     def level(self) -> np.ndarray:
         """The rotation (3, 3) to the rig's frame from its level one, x right, y down, z ahead."""
-        down = -np.array(self.up)
-        right = np.cross(down, self.forward)
-        right /= np.linalg.norm(right)
-        return np.stack((right, down, np.cross(right, down)), 1)
+        return np.array(frame_of(self.up, self.forward, upright=True))
 
     @property
     def middle(self) -> np.ndarray:
@@ -265,13 +260,6 @@ def is_in(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     sides = np.array(size[::-1])
     beyond = np.abs(pixels + 0.5 - sides / 2) - sides / 2
     return np.asarray((beyond <= _ROUNDING).all(-1))  # False for NaN
-
-
-def ahead_of(up: Any) -> Vector:
-    """The direction in a camera's frame that counts as ahead: its axis, or the picture's top if the
-    axis is within 10° of the vertical."""
-    steep = abs(unit_vector("up", up)[2]) > math.cos(math.radians(10))
-    return (0.0, -1.0, 0.0) if steep else (0.0, 0.0, 1.0)
 
 
 def _camera(what: str, lens: Any, size: Any, pose: Any) -> Camera:

@@ -1,10 +1,15 @@
-"""Poses of cameras: matrices that take points of one frame to another."""
+"""Poses of cameras and frames of views: matrices that take points of one frame to another."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from darswin.utils.angles import unit_vector
+
+PICTURE_TOP = (0.0, -1.0, 0.0)
+AXIS = (0.0, 0.0, 1.0)
 # Of R Rᵀ from the identity, if the entries of R were rounded to four digits.
 _ROUNDED = 2e-4
 _EXACT = 1e-9
@@ -52,3 +57,33 @@ def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) about a vector by its length, rad, as of cv2.Rodrigues."""
     half = np.linalg.norm(vector) / 2
     return from_quaternion("", math.cos(half), *(vector / 2 * np.sinc(half / math.pi)))
+
+
+def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> list[list[float]]:
+    """The rotation (3, 3) from the frame of a view to the camera's: its columns are the view's x, y
+    and z.
+
+    z is `direction`, and x is level. If the view is `upright`, y is straight down, and z is the
+    level part of `direction`. Where `direction` is straight up or down, the picture's top is level.
+    """
+    # Arrays: on torch's "meta" device, tensors have no values.
+    above, ahead = np.array([up, direction], np.float64)
+    right = np.cross(ahead, above)
+    if np.linalg.norm(right) < 1e-6:
+        ahead_of_level = np.array(PICTURE_TOP)
+        if np.linalg.norm(np.cross(ahead_of_level, above)) < 1e-6:
+            ahead_of_level = np.array(AXIS)
+        right = np.cross(ahead_of_level, above)
+    axis = above if upright else ahead
+    right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
+    right = right / np.linalg.norm(right)
+    down = -above if upright else np.cross(ahead, right)
+    forward = np.cross(right, down) if upright else ahead
+    return np.stack((right, down, forward), 1).tolist()
+
+
+def ahead_of(up: Any) -> tuple[float, float, float]:
+    """The direction in a camera's frame that counts as ahead: its axis, or the picture's top if the
+    axis is within 10° of the vertical."""
+    level = abs(unit_vector("up", up)[2]) < math.cos(math.radians(10))
+    return AXIS if level else PICTURE_TOP

@@ -13,8 +13,9 @@ from darswin.lens.solve import repeated
 from darswin.ops._library import no_gradients
 from darswin.ops.checks import readable, tensor_there
 from darswin.utils.angles import degrees_hint
+from darswin.utils.poses import AXIS, PICTURE_TOP, frame_of
 from darswin.views.base import Pair, PerChannel, check_lens, in_full_precision
-from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
+from darswin.views.orientation import Vector, unit_vector
 from darswin.views.pixels import PixelView, check_supersampling
 
 _STEEPEST = math.radians(80)  # elevations beyond are far away in maps of the sphere

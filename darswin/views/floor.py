@@ -8,10 +8,10 @@ import torch
 
 from darswin.boxes.arrays import like, table_of
 from darswin.utils.parameters import check
-from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
+from darswin.utils.poses import ahead_of, frame_of
+from darswin.views.orientation import Vector, unit_vector
 
 _LEVEL = math.radians(5)  # by which a view may lean
-_STEEP = math.cos(math.radians(10))
 _CUT = 1.0  # px: a box that ends so near to the lower edge of a view may be cut there
 _STEPS, _STEP, _NEAR = 12, 1e-4, 0.1  # of the search: at most, m, and px that may remain
 _LEVELS = np.linspace(0, 1, 3)[:, None]  # of a cylinder, and the points of its circles
@@ -24,7 +24,7 @@ def on_floor(remap: Any, boxes: Any, height: float, up: Vector, radius: float) -
     """`Remap.floor`."""
     above = check_floor(remap.view, height, up, radius)
     table = table_of(boxes, (4,))
-    frame = np.array(frame_of(above, AXIS if abs(above[2]) < _STEEP else PICTURE_TOP, True))
+    frame = np.array(frame_of(above, ahead_of(above), True))
     foot = np.stack(((table[:, 0] + table[:, 2]) / 2, table[:, 3]), -1)
     right, down, ahead = (remap.rays(foot - 0.5) @ frame).T
     meets = (down > 1e-9) & (table[:, 3] < remap.view_size[0] - _CUT)

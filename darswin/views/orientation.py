@@ -1,10 +1,9 @@
-"""Directions in a camera's frame: what is up, where a view looks, and the frame of a view."""
+"""Directions in a camera's frame: what is up, and where a view looks."""
 
 import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,32 +11,6 @@ from darswin.utils.angles import check_turn, unit_vector
 from darswin.utils.arrays import as_tensor
 
 Vector = Sequence[float] | Tensor
-
-PICTURE_TOP = (0.0, -1.0, 0.0)
-AXIS = (0.0, 0.0, 1.0)
-
-
-def frame_of(up: Sequence[float], direction: Sequence[float], upright: bool) -> list[list[float]]:
-    """The rotation (3, 3) from the frame of a view to the camera's: its columns are the view's x, y
-    and z.
-
-    z is `direction`, and x is level. If the view is `upright`, y is straight down, and z is the
-    level part of `direction`. Where `direction` is straight up or down, the picture's top is level.
-    """
-    # Arrays: on torch's "meta" device, tensors have no values.
-    above, ahead = np.array([up, direction], np.float64)
-    right = np.cross(ahead, above)
-    if np.linalg.norm(right) < 1e-6:
-        ahead_of_level = np.array(PICTURE_TOP)
-        if np.linalg.norm(np.cross(ahead_of_level, above)) < 1e-6:
-            ahead_of_level = np.array(AXIS)
-        right = np.cross(ahead_of_level, above)
-    axis = above if upright else ahead
-    right = right - (right @ axis) * axis  # exactly, also if they are almost parallel
-    right = right / np.linalg.norm(right)
-    down = -above if upright else np.cross(ahead, right)
-    forward = np.cross(right, down) if upright else ahead
-    return np.stack((right, down, forward), 1).tolist()
 
 
 def up_of(

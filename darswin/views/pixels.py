@@ -17,6 +17,7 @@ from darswin.lens.plausible import doubts
 from darswin.lens.rig import Camera, Rig
 from darswin.lens.solve import length_of
 from darswin.ops.checks import as_int, check_pair, tensor_there
+from darswin.utils.poses import AXIS
 from darswin.views.base import (
     Pair,
     PerChannel,
@@ -27,7 +28,6 @@ from darswin.views.base import (
     check_seen_images,
     in_full_precision,
 )
-from darswin.views.orientation import AXIS
 from darswin.views.remap import Remap
 from darswin.views.rig import RigRemap
 from darswin.views.rig_reads import Seam, local

@@ -11,6 +11,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE, as_map, pixel_grid, sample_at
 from darswin.ops.checks import as_int
 from darswin.utils.angles import degrees_hint
+from darswin.utils.poses import AXIS, PICTURE_TOP, frame_of
 from darswin.views.base import (
     Pair,
     PerChannel,
@@ -19,7 +20,7 @@ from darswin.views.base import (
     check_seen_images,
 )
 from darswin.views.directions import check_sees
-from darswin.views.orientation import AXIS, PICTURE_TOP, Vector, frame_of, unit_vector
+from darswin.views.orientation import Vector, unit_vector
 from darswin.views.pixels import PixelView
 from darswin.views.registry import register_view
 from darswin.views.stereographic import StereographicView
