@@ -18,10 +18,11 @@ import pytest
 import torch
 from graphs import write_constants
 from helpers import output
-from scenes import write_classes, write_outlines, write_rooms
+from scenes import write, write_classes, write_outlines, write_rooms
 from torch_abi_audit import inspect_extension
 
 from darswin.frames import _frames
+from darswin.lens.rig import CUBES
 from darswin.ops import _module, cpu_capability, polar_sample
 
 ROOT = Path(__file__).parent.parent
@@ -154,9 +155,14 @@ def write_labels(folder: Path) -> None:
     (folder / "flat.json").write_text('{"model": "Perspective", "fov_deg": 60}')
 
 
-def write_picture(folder: Path) -> None:
+def write_pictures(folder: Path) -> None:
+    shutil.copytree(ROOT / "examples" / "surround", folder / "photos")
+    (folder / "photos" / "rig.json").rename(folder / "rig.json")
     for name, of in (("a.jpg", "parking.jpg"), ("lens.json", "parking.json")):
         shutil.copy(ROOT / "examples" / of, folder / name)
+    (folder / "sim").mkdir()
+    for name in CUBES["carla"]:
+        write(folder / "sim" / f"{name}.png", np.full((90, 90, 3), 99, np.uint8))
     box = np.array([[[100, 100, 200, 200]]], np.float32)
     values = dict(boxes=box, scores=box[..., 0] / 200, labels=box[..., 0].astype(np.int64))
     write_constants(folder / "yolo.onnx", (256, 256), **values)
@@ -166,8 +172,10 @@ def write_picture(folder: Path) -> None:
 ROWS = {
     "calibrate": (lambda at: boards.main([f"{at}/photos", "--count", "8"]), "camera.json"),
     "estimate": (lambda at: write_rooms(at / "photos", 2), "lens.json"),
-    "show": (write_picture, "lens.png"),
-    "predict": (write_picture, "found/overlays/a.jpg"),
+    "show": (write_pictures, "lens.png"),
+    "predict": (write_pictures, "found/overlays/a.jpg"),
+    "fisheye": (write_pictures, "fisheye/images/0000.png"),
+    "stitch": (write_pictures, "ground.png"),
     "warp": (write_labels, "fisheye/annotations.json"),
     "fit": (lambda at: write_classes(at / "photos"), "runs/a/checkpoints/best.safetensors"),
 }
