@@ -187,11 +187,11 @@ def test_the_lines_and_rows_of_the_readme_run_where_it_is_installed(unpacked, tm
     assert json.loads(answer)[0]["top"][0]["class"] == "4"  # as the page says
     first, *_ = (ROOT / "README.md").read_text().partition("## DarSwin")
     typed = re.findall(r"^\| .* \| `(.+)` \|$", first, re.M)
-    for (name, (write, left)), line in zip(ROWS.items(), typed, strict=True):
+    for (name, (prepare, left)), line in zip(ROWS.items(), typed, strict=True):
         words, folder = shlex.split(line), tmp_path / name
         assert name in words[:2]
         folder.mkdir()
-        write(folder)
+        prepare(folder)
         output(unpacked / "empty/bin/darswin", *words, cwd=folder, env=dict(PYTHONPATH=""))
         assert (folder / left).stat().st_size > 0, line
 
