@@ -112,7 +112,7 @@ class ConvUnet(PixelModel):
 
     def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Tensor:
         if prepared.rays is not None:
-            check_count(prepared.rays.shape[0], x)
+            check_count(prepared.rays.shape[0], x.shape[0])
         x = with_rays(x, prepared.rays)
         x = x.contiguous(memory_format=torch.channels_last)
         maps: list[Tensor] = []

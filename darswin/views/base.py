@@ -300,12 +300,12 @@ def check_lens(lens: Lens | None, size: Pair) -> Lens:
     return lens
 
 
-def check_count(lenses: int, images: Tensor) -> None:
-    """ValueError unless there is one lens for each image or one for all. The number of lenses must
-    come from a shape: `len` would fix the batch size of a graph."""
-    if lenses not in (1, images.shape[0]):
+def check_count(lenses: int, images: int) -> None:
+    """ValueError unless there is one lens for each image or one for all. Both numbers must come
+    from shapes: `len` would fix the batch size of a graph."""
+    if lenses not in (1, images):
         raise ValueError(
-            f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
+            f"there must be one lens, or one for each of the {images} images, got {lenses}"
         )
 
 

@@ -227,7 +227,7 @@ class PixelView(View):
         images = self.floating(images, dtype)
         if prepared.points is None:
             return images
-        check_count(prepared.points.shape[0], images)
+        check_count(prepared.points.shape[0], images.shape[0])
         pixels = sample_at(images, prepared.points)
         assert self.size is not None
         supersampling = prepared.points.shape[2] // self.size[1]
@@ -267,7 +267,7 @@ class PixelView(View):
     def check_seen(self, sampled: Tensor, prepared: PreparedPixels, channels: int | None) -> Tensor:
         sampled = check_seen_images(sampled, self.size or prepared.size, channels)
         if prepared.points is not None:
-            check_count(prepared.points.shape[0], sampled)
+            check_count(prepared.points.shape[0], sampled.shape[0])
         return sampled
 
     def extra_repr(self) -> str:

@@ -145,7 +145,7 @@ class PolarView(View):
     def see(
         self, images: Tensor, prepared: PreparedPolar, dtype: torch.dtype = torch.float32
     ) -> Tensor:
-        check_count(prepared.grid.radii.shape[0], images)
+        check_count(prepared.grid.radii.shape[0], images.shape[0])
         # The operator would normalize in float32, and it needs a mean.
         if dtype == torch.float64 or self.mean is None:
             images = self.floating(images, dtype)
@@ -206,7 +206,7 @@ class PolarView(View):
                 "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})",
                 (None, self.rings, self.sectors, values),
             )  # fmt: skip
-        check_count(prepared.grid.radii.shape[0], sampled)
+        check_count(prepared.grid.radii.shape[0], sampled.shape[0])
         return sampled
 
     @property

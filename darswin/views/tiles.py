@@ -174,7 +174,7 @@ class TilesView(PixelView):
                 f"sampled must have {self.count} tiles for each image, got {sampled.shape[0]}"
             )
         assert prepared.points is not None
-        check_count(prepared.points.shape[0], sampled[:: self.count])
+        check_count(prepared.points.shape[0], sampled.shape[0] // self.count)
         return sampled
 
     def rays(self, lens: Lens, size: Pair) -> Tensor:
